@@ -1,0 +1,1 @@
+"""Renderers as JAX functions; each module is imported only by who asks for it."""
