@@ -1,0 +1,104 @@
+"""Evaluating the function at sampled points: the only place that calls it."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from smoothdiff._baselines import AbstractBaseline, Control
+from smoothdiff._draws import Draws
+from smoothdiff._params import Params
+from smoothdiff._samplers import AbstractSampler
+
+
+class Batch(eqx.Module):
+    """Points with the function's values there; arrays only, so that it crosses jit and scan.
+
+    `values` and `aux` have one leading row per sample. `scale` is one over the number of samples
+    that count, or NaN where the estimate is void. `valid` marks the samples that count, None if
+    all do.
+    """
+
+    draws: Draws
+    values: PyTree
+    control: Control
+    log_ratio: Array | None
+    valid: Array | None
+    scale: Array
+    aux: PyTree
+
+    def without_aux(self) -> "Batch":
+        """The batch for a model that keeps it; aux can be large and says nothing of derivatives."""
+        return replace(self, aux=None)
+
+
+def evaluate(
+    fun: Callable[[Array, list], tuple[PyTree, PyTree]],
+    params: Params,
+    key: Array,
+    *,
+    num_samples: int,
+    sampler: AbstractSampler,
+    baseline: AbstractBaseline,
+    batch_size: int | None,
+    nonfinite: Literal["propagate", "drop"],
+    free_rows: list | None = None,
+) -> Batch:
+    """Draws points around the parameters and evaluates `fun(theta, free) -> (value, aux)` there.
+
+    The points are stopped gradients, so that neither AD nor a callback's missing derivative
+    follows the function through them. `free_rows` gives each sample its own copy of the leaves
+    that are not smoothed.
+    """
+    theta, sigma = jax.lax.stop_gradient((params.theta, params.sigma))
+    extra = baseline.evaluations()
+    draws = Draws(sampler, key, num_samples - extra, theta.size, theta.dtype, batch_size)
+    free = params.free if free_rows is None else free_rows
+
+    def row(z: Array, free: list):
+        # the function sees the clamped point; the weights will see the unclamped z
+        return fun(params.clip(theta + sigma * z), free)
+
+    def rows(z: Array, log_ratio: Array | None):
+        values, aux = jax.vmap(row, in_axes=(0, None if free_rows is None else 0))(z, free)
+        return values, aux, log_ratio
+
+    values, aux, log_ratio = draws.map(rows)
+    center = fun(params.clip(theta), params.free)[0] if extra else None
+    _check_values(values)
+    valid = None
+    if nonfinite == "drop":
+        valid = jnp.stack([_finite(v) for v in jax.tree.leaves(values)]).all(axis=0)
+        values = jax.tree.map(lambda v: jnp.where(_like(valid, v), v, 0), values)
+    control = baseline(values, draws, log_ratio, valid, center)
+    if valid is None:
+        scale = jnp.full((), 1 / draws.num, theta.dtype)
+    else:
+        masked = jax.tree.map(lambda r: jnp.where(_like(valid, r), r, 0), control.residual)
+        control = Control(masked, control.mean)
+        count = jnp.sum(valid).astype(theta.dtype)
+        scale = jnp.where(2 * count >= draws.num, 1 / count, jnp.nan)
+    if params.inside is not None:
+        scale = jnp.where(params.inside, scale, jnp.nan)
+    return Batch(draws, values, control, log_ratio, valid, scale, aux)
+
+
+def _like(rows: Array, values: Array) -> Array:
+    return rows.reshape(-1, *[1] * (values.ndim - 1))
+
+
+def _finite(values: Array) -> Array:
+    return jnp.isfinite(values).reshape(values.shape[0], -1).all(axis=1)
+
+
+def _check_values(values: PyTree) -> None:
+    for leaf in jax.tree.leaves(values):
+        if not jnp.issubdtype(leaf.dtype, jnp.floating):
+            raise TypeError(
+                f"the function returned dtype {leaf.dtype}; a smoothed function must return "
+                "real floating-point values: use .astype(float)"
+            )

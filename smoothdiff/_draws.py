@@ -1,0 +1,91 @@
+"""The points of one estimate as a pytree: kept in memory, or drawn again chunk by chunk."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from smoothdiff._samplers import AbstractSampler
+
+
+class Draws(eqx.Module):
+    """`num` points in n dimensions. Without a chunk size they are drawn once and kept.
+
+    With one, only the key is kept: every pass over the points draws each chunk again, which costs
+    random numbers but no memory and, above all, no evaluation of the user's function.
+    """
+
+    key_data: Array
+    kept: tuple[Array, Array | None] | None
+    sampler: AbstractSampler
+    num: int = eqx.field(static=True)
+    n: int = eqx.field(static=True)
+    chunk: int = eqx.field(static=True)
+    impl: str = eqx.field(static=True)
+    dtype: jnp.dtype = eqx.field(static=True)
+
+    def __init__(
+        self, sampler: AbstractSampler, key: Array, num: int, n: int, dtype, batch_size: int | None
+    ):
+        sampler.check(num, n)
+        block = sampler.block(n)
+        self.sampler = sampler
+        self.key_data = jax.random.key_data(key)
+        self.impl = str(jax.random.key_impl(key))
+        self.num, self.n, self.dtype = num, n, jnp.dtype(dtype)
+        # whole blocks only, and at least one
+        chunk = num if batch_size is None else max(block, batch_size // block * block)
+        self.chunk = min(num, chunk)
+        self.kept = self._draw(0, num) if self.chunk == num else None
+
+    def _draw(self, start, count: int):
+        key = jax.random.wrap_key_data(self.key_data, impl=self.impl)
+        return self.sampler.draw(key, start, count, self.num, self.n, self.dtype)
+
+    def _chunks(self, rows: PyTree) -> tuple[Array, PyTree, PyTree]:
+        """Starts of the full chunks, their rows stacked, and the rows of the last, shorter one."""
+        full = self.num // self.chunk
+        starts = jnp.arange(full) * self.chunk
+        cut = full * self.chunk
+        stacked = jax.tree.map(lambda a: a[:cut].reshape(full, self.chunk, *a.shape[1:]), rows)
+        return starts, stacked, jax.tree.map(lambda a: a[cut:], rows)
+
+    def map(self, fun: Callable[..., PyTree]) -> PyTree:
+        """Applies `fun(z, log_ratio)` to the points and returns its rows, in order."""
+        if self.kept is not None:
+            return fun(*self.kept)
+        starts, _, _ = self._chunks(())
+        out = jax.lax.map(lambda start: fun(*self._draw(start, self.chunk)), starts)
+        out = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), out)
+        rest = self.num % self.chunk
+        if rest:
+            last = fun(*self._draw(self.num - rest, rest))
+            out = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), out, last)
+        return out
+
+    def sum(self, fun: Callable[..., PyTree], rows: PyTree) -> PyTree:
+        """Adds up `fun(start, z, log_ratio, rows)` over the chunks; `fun` sums over its own rows.
+
+        Under reverse-mode AD a chunk is drawn again rather than remembered.
+        """
+        if self.kept is not None:
+            return fun(0, *self.kept, rows)
+        starts, stacked, rest = self._chunks(rows)
+
+        @jax.checkpoint
+        def chunk(start, part):
+            return fun(start, *self._draw(start, self.chunk), part)
+
+        def add(total, inputs):
+            return jax.tree.map(jnp.add, total, chunk(*inputs)), None
+
+        shape = jax.eval_shape(chunk, starts[0], jax.tree.map(lambda a: a[0], stacked))
+        zero = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shape)
+        total, _ = jax.lax.scan(add, zero, (starts, stacked))
+        left = self.num % self.chunk
+        if left:
+            start = self.num - left
+            total = jax.tree.map(jnp.add, total, fun(start, *self._draw(start, left), rest))
+        return total

@@ -1,0 +1,241 @@
+"""The smoothed parameters of a call as one vector, and back: sigma, bounds and their checks."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, PyTree
+
+
+def is_concrete(x: Any) -> bool:
+    """Whether the value can be looked at now, which it cannot while JAX traces it."""
+    return not isinstance(x, jax.core.Tracer)
+
+
+def as_key(key: Any) -> Array:
+    """A typed key from a typed or raw one."""
+    dtype = getattr(key, "dtype", None)
+    if dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key):
+        if key.ndim == 0:
+            return key
+    elif dtype == jnp.uint32 and key.ndim == 1 and key.size in (2, 4):
+        return jax.random.wrap_key_data(key)
+    raise TypeError(
+        "the first argument must be one random key: call g(jax.random.key(0), *args), "
+        f"not g({type(key).__name__}, ...); for many keys use jax.vmap"
+    )
+
+
+def as_argnums(argnums: int | Sequence[int], num_args: int) -> tuple[int, ...]:
+    """The chosen positions among `num_args` arguments of the function, as non-negative numbers."""
+    chosen = (argnums,) if isinstance(argnums, int) else tuple(argnums)
+    for i in chosen:
+        if not -num_args <= i < num_args:
+            raise ValueError(
+                f"argnums={argnums} but the function was given {num_args} positional argument(s) "
+                "after the key; argnums counts the function's own arguments, from 0"
+            )
+    chosen = tuple(i % num_args for i in chosen)
+    if len(set(chosen)) < len(chosen):
+        raise ValueError(f"argnums={argnums} names an argument twice")
+    return chosen
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How the leaves of a pytree lie in one vector; leaves that are not smoothed stay outside."""
+
+    treedef: Any
+    shapes: tuple[tuple[int, ...], ...]
+    dtypes: tuple[np.dtype, ...]
+    smoothed: tuple[bool, ...]
+
+    @property
+    def dtype(self) -> np.dtype:
+        """The widest dtype of the smoothed leaves, which the vector has."""
+        kept = [d for d, s in zip(self.dtypes, self.smoothed, strict=True) if s]
+        return max(kept, key=lambda d: jnp.finfo(d).bits)
+
+    def vector(self, leaves: Sequence[Any]) -> Array:
+        """One vector from one entry per leaf, each broadcast to the shape of its leaf."""
+        parts = [
+            jnp.broadcast_to(jnp.asarray(leaf).astype(self.dtype), shape).reshape(-1)
+            for leaf, shape, keep in zip(leaves, self.shapes, self.smoothed, strict=True)
+            if keep
+        ]
+        return parts[0] if len(parts) == 1 else jnp.concatenate(parts)
+
+    def tree(self, x: Array, free: Sequence[Any] = ()) -> PyTree:
+        """The pytree whose smoothed leaves come from the last axis of `x`, the others from `free`.
+
+        Axes of `x` before the last lead the shape of every smoothed leaf.
+        """
+        rest, leaves, start = iter(free), [], 0
+        for shape, dtype, keep in zip(self.shapes, self.dtypes, self.smoothed, strict=True):
+            if not keep:
+                leaves.append(next(rest))
+                continue
+            stop = start + math.prod(shape)
+            leaves.append(x[..., start:stop].reshape(*x.shape[:-1], *shape).astype(dtype))
+            start = stop
+        return self.treedef.unflatten(leaves)
+
+
+@dataclass(frozen=True)
+class Params:
+    """The arguments of one call, taken apart.
+
+    `theta`, `sigma`, `low` and `high` have one entry for each smoothed number. `free` holds the
+    leaves whose sigma is None. `inside` is False where traced bounds or parameters are invalid.
+    """
+
+    layout: Layout
+    theta: Array
+    sigma: Array
+    sigma_traced: bool
+    low: Array | None
+    high: Array | None
+    inside: Array | None
+    free: list[Array]
+
+    def clip(self, x: Array) -> Array:
+        """The point that the function may see: within the bounds, if there are any."""
+        return x if self.low is None else jnp.clip(x, self.low, self.high)
+
+
+def choose(args: tuple, argnums: int | Sequence[int]) -> PyTree:
+    """The chosen argument, or the tuple of chosen arguments if `argnums` is a sequence."""
+    chosen = as_argnums(argnums, len(args))
+    return args[chosen[0]] if isinstance(argnums, int) else tuple(args[i] for i in chosen)
+
+
+def replace(args: tuple, argnums: int | Sequence[int], new: PyTree) -> tuple:
+    """The arguments with the chosen ones replaced; undoes `choose`."""
+    chosen = as_argnums(argnums, len(args))
+    out = list(args)
+    for i, value in zip(chosen, (new,) if isinstance(argnums, int) else new, strict=True):
+        out[i] = value
+    return tuple(out)
+
+
+def take_apart(target: PyTree, sigma: PyTree, bounds: tuple[PyTree, PyTree] | None) -> Params:
+    """Checks the parameters of a call and lays the smoothed leaves out as one vector."""
+    paths, treedef = jax.tree_util.tree_flatten_with_path(target)
+    names = [jax.tree_util.keystr(path) for path, _ in paths]
+    sigmas = _match(sigma, target, "sigma")
+    smoothed = tuple(s is not None for s in sigmas)
+    if not any(smoothed):
+        raise ValueError(
+            "nothing is smoothed: give at least one leaf of the parameters a positive sigma, or "
+            "differentiate the function with jax.grad itself"
+        )
+    leaves = [
+        _as_real(leaf, name) if keep else jnp.asarray(leaf)
+        for (_, leaf), name, keep in zip(paths, names, smoothed, strict=True)
+    ]
+    for s, leaf, name in zip(sigmas, leaves, names, strict=True):
+        if s is not None:
+            _check_sigma(s, leaf, name)
+    layout = Layout(
+        treedef, tuple(x.shape for x in leaves), tuple(x.dtype for x in leaves), smoothed
+    )
+    theta, width = layout.vector(leaves), layout.vector(sigmas)
+    sigma_traced = not all(map(is_concrete, sigmas))
+    if sigma_traced:
+        width = jnp.where(width > 0, width, jnp.nan)
+    low = high = inside = None
+    if bounds is not None:
+        if not (isinstance(bounds, tuple | list) and len(bounds) == 2):
+            raise ValueError("bounds must be a pair (low, high) of numbers or pytrees")
+        lows = _sides(bounds[0], -np.inf, target)
+        highs = _sides(bounds[1], np.inf, target)
+        for lo, hi, leaf, name, keep in zip(lows, highs, leaves, names, smoothed, strict=True):
+            if keep:
+                _check_bounds(lo, hi, leaf, name)
+        low, high = layout.vector(lows), layout.vector(highs)
+        if not all(map(is_concrete, (low, high, theta))):
+            inside = jnp.all((low <= theta) & (theta <= high))
+    free = [leaf for leaf, keep in zip(leaves, smoothed, strict=True) if not keep]
+    return Params(layout, theta, width, sigma_traced, low, high, inside, free)
+
+
+def _match(value: PyTree, target: PyTree, what: str) -> list:
+    """One entry of `value` for each leaf of `target`; a number stands for all of them."""
+    try:
+        full = jax.tree.broadcast(value, target, is_leaf=lambda v: v is None)
+    except ValueError as error:
+        raise ValueError(
+            f"{what} must be a number or a pytree with the structure of the parameters, "
+            f"{jax.tree.structure(target)}, not {jax.tree.structure(value)}"
+        ) from error
+    # a None in the parameters themselves is no leaf, so it needs no entry
+    return jax.tree.structure(target).flatten_up_to(full)
+
+
+def _as_real(leaf: Any, name: str) -> Array:
+    leaf = jnp.asarray(leaf)
+    if not jnp.issubdtype(leaf.dtype, jnp.floating):
+        raise TypeError(
+            f"the smoothed parameter{name} has dtype {leaf.dtype}: pass real floating-point "
+            "parameters (x.astype(float); round inside the function), or set sigma to None there"
+        )
+    return leaf
+
+
+def _check_shape(value: Any, leaf: Array, what: str, name: str) -> None:
+    try:
+        fits = np.broadcast_shapes(jnp.shape(value), leaf.shape) == leaf.shape
+    except ValueError:
+        fits = False
+    if not fits:
+        raise ValueError(
+            f"{what}{name} has shape {jnp.shape(value)}, which does not broadcast to its "
+            f"parameter's shape {leaf.shape}"
+        )
+
+
+def _check_sigma(sigma: Any, leaf: Array, name: str) -> None:
+    _check_shape(sigma, leaf, "sigma", name)
+    if jnp.iscomplexobj(sigma):
+        raise TypeError(f"sigma{name} is complex: the smoothing width must be a real number")
+    if not is_concrete(sigma):
+        return
+    width = np.asarray(sigma)
+    if not np.all((width > 0) & np.isfinite(width)):
+        raise ValueError(
+            f"sigma{name} = {sigma}: the smoothing width must be positive and finite; "
+            "use None for a leaf that is not to be smoothed"
+        )
+    if is_concrete(leaf):
+        # half a spacing either way rounds back to theta: every sample would be the same point
+        spacing = np.abs(np.spacing(np.abs(np.asarray(leaf))))
+        if np.any(width < spacing):
+            raise ValueError(
+                f"sigma{name} = {sigma} is below the spacing of {leaf.dtype} at its parameter, so "
+                "samples round to the parameter itself: use a larger sigma, float64, or "
+                "parameters in other units"
+            )
+
+
+def _sides(side: PyTree, default: float, target: PyTree) -> list:
+    return [default if s is None else s for s in _match(side, target, "bounds")]
+
+
+def _check_bounds(low: Any, high: Any, leaf: Array, name: str) -> None:
+    for side in (low, high):
+        _check_shape(side, leaf, "bounds", name)
+    if is_concrete(low) and is_concrete(high) and not np.all(np.asarray(low) <= np.asarray(high)):
+        raise ValueError(f"bounds{name}: low = {low} is above high = {high}; give (low, high)")
+    if all(map(is_concrete, (low, high, leaf))):
+        x = np.asarray(leaf)
+        dtype = x.dtype
+        if np.any((x < np.asarray(low, dtype)) | (x > np.asarray(high, dtype))):
+            raise ValueError(
+                f"the parameter{name} = {x} lies outside its bounds ({low}, {high}): clip it "
+                "first, or widen the bounds"
+            )

@@ -1,0 +1,573 @@
+"""The public transforms: a function in, its smoothed value or a derivative of that out."""
+
+import inspect
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from functools import partial, wraps
+from typing import Any, Literal, Protocol, TypedDict, Unpack
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from smoothdiff._baselines import AbstractBaseline, as_baseline
+from smoothdiff._batch import Batch, evaluate
+from smoothdiff._estimate import combine, displacement
+from smoothdiff._params import Params, as_argnums, as_key, choose, replace, take_apart
+from smoothdiff._quadratic import HessianOperator, QuadraticModel
+from smoothdiff._samplers import AbstractSampler, Gaussian
+from smoothdiff._stderr import (
+    free_grad_stderr,
+    grad_stderr,
+    jacobian_stderr,
+    value_stderr,
+)
+
+
+class Options(TypedDict, total=False):
+    """What every transform takes beside the function and sigma, by keyword.
+
+    Args:
+        argnums: which of the function's arguments to smooth and differentiate, an int or a tuple.
+        num_samples: evaluations of the function in one call, all included.
+        sampler: where to sample, a sampler object such as `Gaussian(antithetic=True)`.
+        baseline: what to subtract: "none", "mean" (of the other samples), "center" (f(theta), one
+            evaluation) or a baseline object.
+        bounds: a pair (low, high), each a number or a pytree like the parameters. The function
+            sees points clamped to them; the weights see the points as drawn.
+        batch_size: evaluate and differentiate at most so many samples at a time, which bounds the
+            memory. The estimate is the same but for rounding.
+        nonfinite: "propagate" a NaN or infinite sample into the estimate, or "drop" it and
+            re-weight the others; NaN if fewer than half are left.
+        has_aux: the function returns (value, aux); aux comes back with one row per sample.
+        stderr: also return the standard error of the estimate.
+    """
+
+    argnums: int | Sequence[int]
+    num_samples: int
+    sampler: AbstractSampler
+    baseline: str | AbstractBaseline
+    bounds: tuple[PyTree, PyTree] | None
+    batch_size: int | None
+    nonfinite: Literal["propagate", "drop"]
+    has_aux: bool
+    stderr: bool
+
+
+@dataclass(frozen=True)
+class _Call:
+    """A function with its options checked, ready to be evaluated for given arguments."""
+
+    fun: Callable
+    sigma: Any
+    argnums: int | Sequence[int] = 0
+    num_samples: int = 64
+    sampler: AbstractSampler = Gaussian()  # noqa: RUF009 (a frozen module)
+    baseline: str | AbstractBaseline = "mean"
+    bounds: tuple[PyTree, PyTree] | None = None
+    batch_size: int | None = None
+    nonfinite: Literal["propagate", "drop"] = "propagate"
+    has_aux: bool = False
+    stderr: bool = False
+
+    def __post_init__(self):
+        if not callable(self.fun):
+            raise TypeError(f"the first argument must be a function, not {type(self.fun).__name__}")
+        if not isinstance(self.sampler, AbstractSampler):
+            raise TypeError(f"sampler must be a sampler object such as Gaussian(): {self.sampler}")
+        if self.nonfinite not in ("propagate", "drop"):
+            raise ValueError(f'nonfinite must be "propagate" or "drop", not {self.nonfinite!r}')
+        for name in ("num_samples", "batch_size"):
+            value = getattr(self, name)
+            if value is not None and (not isinstance(value, int) or value < 1):
+                raise ValueError(f"{name} must be a positive integer, not {value!r}")
+        extra = as_baseline(self.baseline).evaluations()
+        if self.num_samples <= extra:
+            raise ValueError(
+                f"num_samples={self.num_samples} leaves no samples: baseline={self.baseline!r} "
+                f"itself needs {extra}"
+            )
+
+    def options(self) -> Options:
+        """The options as a transform takes them."""
+        return {f.name: getattr(self, f.name) for f in fields(self)[2:]}  # pyright: ignore
+
+    def params(self, args: tuple) -> Params:
+        return take_apart(choose(args, self.argnums), self.sigma, self.bounds)
+
+    def batch(
+        self, key: Any, args: tuple, params: Params, *, scalar: bool, free_rows: list | None = None
+    ) -> Batch:
+        """One batch of evaluations; everything that a transform returns comes from it."""
+
+        def fun(theta: Array, free: list) -> tuple[PyTree, PyTree]:
+            out = self.fun(*replace(args, self.argnums, params.layout.tree(theta, free)))
+            value, aux = out if self.has_aux else (out, None)
+            value = jax.tree.map(jnp.asarray, value)
+            if scalar and not (isinstance(value, jax.Array) and value.shape == ()):
+                shape = jax.tree.map(jnp.shape, value)
+                raise TypeError(
+                    f"the function must return a scalar here, not an output of shape {shape}: use "
+                    "smooth_jacobian, or return a loss (jnp.sum, jnp.mean) of the output"
+                )
+            return value, aux
+
+        return evaluate(
+            fun,
+            params,
+            as_key(key),
+            num_samples=self.num_samples,
+            sampler=self.sampler,
+            baseline=as_baseline(self.baseline),
+            batch_size=self.batch_size,
+            nonfinite=self.nonfinite,
+            free_rows=free_rows,
+        )
+
+    def smoothed(self, key: Any, *args: Any, scalar: bool = False) -> tuple[PyTree, PyTree]:
+        """(value, aux) of the smoothed function; differentiating it is the whole library."""
+        params = self.params(args)
+        batch = self.batch(key, args, params, scalar=scalar)
+        return combine(batch, *displacement(params)), batch.aux
+
+    def shifted_argnums(self, num_args: int) -> int | tuple[int, ...]:
+        """Where the parameters stand among the arguments of the smoothed function, key first."""
+        chosen = tuple(i + 1 for i in as_argnums(self.argnums, num_args))
+        return chosen[0] if isinstance(self.argnums, int) else chosen
+
+    def only_smoothed(self, params: Params, what: str) -> None:
+        if params.free:
+            raise ValueError(
+                f"{what} needs a sigma for every leaf: leave the leaves with sigma None out of "
+                "argnums, or pass them as other arguments"
+            )
+
+    def out(self, estimate: PyTree, aux: PyTree, error: PyTree = None) -> PyTree:
+        """The estimate in the form that the options ask for."""
+        result = (estimate, aux) if self.has_aux else estimate
+        return (result, error) if self.stderr else result
+
+
+class _Transform(Protocol):
+    def __call__(
+        self, fun: Callable[..., Any], sigma: PyTree, **options: Unpack[Options]
+    ) -> Callable[..., Any]: ...
+
+
+def _transform(**defaults: Any) -> Callable[[Callable[[_Call], Callable]], _Transform]:
+    """Gives a transform its options: defaults of its own, checks, and a signature that shows them.
+
+    The decorated function receives a `_Call` and returns the function that users call.
+    """
+
+    def decorate(make: Callable[[_Call], Callable]) -> _Transform:
+        known = {f.name: f.default for f in fields(_Call)[2:]} | defaults
+
+        @wraps(make)
+        def transform(fun: Callable, sigma: PyTree, **options: Unpack[Options]) -> Callable:
+            unknown = sorted(set(options) - set(known))
+            if unknown:
+                raise TypeError(f"{make.__name__} has no option {unknown}; it has {sorted(known)}")
+            call = _Call(fun, sigma, **{**known, **options})
+            return make(call)
+
+        hints = Options.__annotations__
+        kind = inspect.Parameter
+        shown = [kind("fun", kind.POSITIONAL_OR_KEYWORD, annotation=Callable)]
+        shown += [kind("sigma", kind.POSITIONAL_OR_KEYWORD, annotation=PyTree)]
+        shown += [
+            kind(name, kind.KEYWORD_ONLY, default=default, annotation=hints[name])
+            for name, default in known.items()
+        ]
+        signature = inspect.Signature(shown, return_annotation=Callable)
+        transform.__signature__ = signature  # pyright: ignore[reportAttributeAccessIssue]
+        return transform
+
+    return decorate
+
+
+@_transform(sampler=Gaussian(antithetic=True))
+def smooth(call: _Call) -> Callable:
+    r"""The function convolved with a Gaussian, as a function of a key that JAX can differentiate.
+
+    $$ F(\theta) = \mathbb{E}_{z \sim \mathcal{N}(0, I)}[f(\theta + \sigma z)] $$
+
+    Estimated from evaluations of f alone, which may be a black box. `jax.grad`, `jax.hessian`,
+    `jax.jvp`, `jax.linearize` and so on of the result, with respect to the smoothed parameters,
+    sigma, and (if f can be differentiated there) everything else, are the unbiased estimates that
+    the same evaluations give; no derivative of f with respect to smoothed parameters is taken.
+
+    Args:
+        fun: the function; returns an array or a pytree of arrays. Under `jax.vmap`.
+        sigma: the width of the Gaussian in the units of the parameters: a number, or a pytree
+            like the parameters with numbers or arrays that broadcast to them. None in a leaf: not
+            smoothed, not sampled, differentiated by AD. It may be traced and differentiated.
+        **options: see `Options`; the signature shows the defaults.
+
+    Returns:
+        `g(key, *args)`: the smoothed value, shaped like the output of `fun`; with `has_aux` the
+        pair of it and aux, with `stderr=True` the pair of that and standard errors.
+
+    Raises:
+        ValueError, TypeError: an argument that cannot work and can be looked at. Traced arguments
+            that turn out invalid give NaN.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, smoothdiff as sd
+        >>> step = lambda x: jnp.where(x > 0, 1.0, 0.0)
+        >>> g = sd.smooth(step, 0.5, num_samples=10_000)
+        >>> print(f"{jax.grad(g, argnums=1)(jax.random.key(0), 0.0):.2f}")
+        0.80
+
+    Source: Stochastic Gradient Estimation for Higher-order Differentiable Rendering, eq. 13-15.
+    """
+
+    def g(key: Any, *args: Any) -> PyTree:
+        if not call.stderr:
+            return call.out(*call.smoothed(key, *args))
+        params = call.params(args)
+        batch = call.batch(key, args, params, scalar=False)
+        value = combine(batch, *displacement(params))
+        return call.out(value, batch.aux, value_stderr(batch, value))
+
+    return g
+
+
+@_transform(sampler=Gaussian(antithetic=True))
+def smooth_value_and_grad(call: _Call) -> Callable:
+    r"""Value and gradient of the smoothed function from one batch, like `jax.value_and_grad`.
+
+    See [`smooth_grad`][smoothdiff.smooth_grad] for the equation.
+
+    Args:
+        fun: a function with a scalar output.
+        sigma: as for `smooth`.
+        **options: see `Options`.
+
+    Returns:
+        `g(key, *args)`: `(value, grad)`; with `has_aux` `((value, aux), grad)`; with `stderr=True`
+        the pair of that and `(value_stderr, grad_stderr)`.
+
+    Raises:
+        ValueError, TypeError: as `smooth`, and if the output of `fun` is no scalar.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, smoothdiff as sd
+        >>> g = sd.smooth_value_and_grad(jnp.abs, 0.1)
+        >>> value, grad = g(jax.random.key(0), 2.0)
+        >>> print(f"{value:.3f} {grad:.3f}")
+        2.000 1.016
+
+    Source: Stochastic Gradient Estimation for Higher-order Differentiable Rendering, eq. 17.
+    """
+
+    def g(key: Any, *args: Any) -> PyTree:
+        params = call.params(args)  # bad arguments are reported before AD hides their values
+        if call.stderr:
+            value, aux, grad, error = _first_order(call, key, args, params)
+            pair = (value, aux) if call.has_aux else value
+            return (pair, grad), error
+        fun = jax.value_and_grad(
+            partial(call.smoothed, scalar=True), call.shifted_argnums(len(args)), has_aux=True
+        )
+        (value, aux), grad = fun(key, *args)
+        return ((value, aux) if call.has_aux else value), grad
+
+    return g
+
+
+@_transform(sampler=Gaussian(antithetic=True))
+def smooth_grad(call: _Call) -> Callable:
+    r"""The gradient of the smoothed function, like `jax.grad`.
+
+    $$ \nabla F(\theta) = \frac1\sigma \mathbb{E}[f(\theta + \sigma z) \, z]
+       \approx \frac{1}{N} \sum_i w_i (f_i - b_i) \, \frac{z_i}{\sigma} $$
+
+    Args:
+        fun: a function with a scalar output.
+        sigma: as for `smooth`.
+        **options: see `Options`.
+
+    Returns:
+        `g(key, *args)`: the gradient, like the parameters; with `has_aux` `(grad, aux)`; with
+        `stderr=True` the pair of that and the standard errors of the gradient.
+
+    Raises:
+        ValueError, TypeError: as `smooth`, and if the output of `fun` is no scalar.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, smoothdiff as sd
+        >>> plateau = lambda x: jnp.floor(jnp.sum(x))
+        >>> g, err = sd.smooth_grad(plateau, 0.5, stderr=True)(jax.random.key(0), jnp.ones(2))
+        >>> g.shape, err.shape
+        ((2,), (2,))
+
+    Source: Stochastic Gradient Estimation for Higher-order Differentiable Rendering, eq. 17.
+    """
+    both = smooth_value_and_grad(call.fun, call.sigma, **call.options())
+
+    def g(key: Any, *args: Any) -> PyTree:
+        out = both(key, *args)
+        (value, grad), error = out if call.stderr else (out, (None, None))
+        return call.out(grad, value[1] if call.has_aux else None, error[1])
+
+    return g
+
+
+def _first_order(call: _Call, key: Any, args: tuple, params: Params) -> tuple:
+    """(value, aux, grad, (value_stderr, grad_stderr)) from one batch."""
+    copies = None
+    if params.free:
+        if call.batch_size is not None:
+            call.only_smoothed(params, "stderr with batch_size")
+        # a copy for each sample, so that one reverse pass gives the derivative of each
+        rows = call.num_samples - as_baseline(call.baseline).evaluations()
+        copies = [jnp.broadcast_to(leaf, (rows, *leaf.shape)) for leaf in params.free]
+
+    def value_of(free_rows: list | None) -> tuple[Array, tuple[Batch, Array]]:
+        batch = call.batch(key, args, params, scalar=True, free_rows=free_rows)
+        return (value := combine(batch, jnp.zeros_like(params.theta))), (batch, value)
+
+    free_grads, (batch, value) = jax.grad(value_of, has_aux=True)(copies)
+    grad = jax.grad(lambda shift: combine(batch, shift))(jnp.zeros_like(params.theta))
+    error = grad_stderr(batch, grad)
+    means, errors = [], []
+    for per_row in free_grads or []:
+        mean, spread = free_grad_stderr(batch, per_row)
+        means.append(mean)
+        errors.append(spread)
+    tree = params.layout.tree
+    estimate = tree(grad / params.sigma, means)
+    return (
+        value,
+        batch.aux,
+        estimate,
+        (value_stderr(batch, value), tree(error / params.sigma, errors)),
+    )
+
+
+@_transform(sampler=Gaussian(antithetic=True))
+def smooth_jacobian(call: _Call) -> Callable:
+    r"""The Jacobian of the smoothed function, like `jax.jacfwd` and `jax.jacrev`.
+
+    $$ \frac{\partial F_p}{\partial \theta_j}
+       \approx \frac{1}{N} \sum_i w_i (f_{ip} - b_{ip}) \, \frac{z_{ij}}{\sigma_j} $$
+
+    Args:
+        fun: a function whose output is an array or a pytree of arrays, an image for example.
+        sigma: as for `smooth`.
+        **options: see `Options`.
+
+    Returns:
+        `g(key, *args)`: for each leaf of the output the structure of the parameters, with leaves
+        of shape output shape + parameter shape; with `has_aux` and `stderr=True` as `smooth`.
+
+    Raises:
+        ValueError, TypeError: as `smooth`; `stderr=True` with a sigma of None.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, smoothdiff as sd
+        >>> image = lambda x: jnp.where(jnp.arange(4.0) < x, 1.0, 0.0)
+        >>> sd.smooth_jacobian(image, 1.0)(jax.random.key(0), jnp.float32(2.0)).shape
+        (4,)
+
+    Source: Stochastic Gradient Estimation for Higher-order Differentiable Rendering, eq. 17.
+    """
+
+    def g(key: Any, *args: Any) -> PyTree:
+        params = call.params(args)
+        if not call.stderr:
+            outputs = jax.eval_shape(call.smoothed, key, *args)[0]
+            size = sum(leaf.size for leaf in jax.tree.leaves(outputs))
+            # forward mode has one pass per parameter, reverse mode one per output
+            jacobian = jax.jacfwd if params.theta.size <= size else jax.jacrev
+            fun = jacobian(call.smoothed, call.shifted_argnums(len(args)), has_aux=True)
+            return call.out(*fun(key, *args))
+        call.only_smoothed(params, "stderr of a Jacobian")
+        batch = call.batch(key, args, params, scalar=False)
+        jacobian = jax.jacfwd(lambda shift: combine(batch, shift))(jnp.zeros_like(params.theta))
+        error = jacobian_stderr(batch, jacobian)
+
+        def per_parameter(leaf: Array) -> PyTree:
+            sigma = jnp.broadcast_to(params.sigma, leaf.shape)
+            tree = params.layout.tree(leaf.astype(sigma.dtype) / sigma)
+            return jax.tree.map(lambda j: j.astype(leaf.dtype), tree)
+
+        estimate = jax.tree.map(per_parameter, jacobian)
+        error = jax.tree.map(per_parameter, error)
+        return call.out(estimate, batch.aux, error)
+
+    return g
+
+
+@_transform()
+def smooth_hessian(call: _Call) -> Callable:
+    r"""The Hessian of the smoothed function, like `jax.hessian`.
+
+    $$ \nabla^2 F(\theta)
+       \approx \frac{1}{N} \sum_i w_i (f_i - b_i) \, \frac{z_i z_i^T - I}{\sigma^2} $$
+
+    Antithetic pairs do not help here, so the default sampler has none.
+
+    Args:
+        fun: a function with a scalar output.
+        sigma: as for `smooth`.
+        **options: see `Options`.
+
+    Returns:
+        `g(key, *args)`: the Hessian in the nested structure of `jax.hessian`; with `has_aux` and
+        `stderr=True` as `smooth`.
+
+    Raises:
+        ValueError, TypeError: as `smooth`; an output that is no scalar; `stderr=True` with a sigma
+            of None.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, smoothdiff as sd
+        >>> f = lambda x: jnp.sum(jnp.round(x)) ** 2
+        >>> sd.smooth_hessian(f, 0.5)(jax.random.key(0), jnp.ones(3)).shape
+        (3, 3)
+
+    Source: Stochastic Gradient Estimation for Higher-order Differentiable Rendering, eq. 20.
+    """
+
+    def g(key: Any, *args: Any) -> PyTree:
+        params = call.params(args)
+        if not call.stderr:
+            fun = partial(call.smoothed, scalar=True)
+            hessian = jax.hessian(fun, call.shifted_argnums(len(args)), has_aux=True)
+            return call.out(*hessian(key, *args))
+        call.only_smoothed(params, "stderr of a Hessian")
+        batch = call.batch(key, args, params, scalar=True)
+        operator = HessianOperator(batch, params.sigma, params.layout)
+
+        def column(j: Array) -> tuple[PyTree, PyTree]:
+            unit = params.layout.tree(
+                (jnp.arange(params.theta.size) == j).astype(params.theta.dtype)
+            )
+            return operator.mv(unit), operator.stderr(unit)
+
+        columns = jax.lax.map(column, jnp.arange(params.theta.size))
+        # the Hessian is symmetric: what lax.map stacked in front becomes the last axes
+        estimate, error = (
+            jax.tree.map(lambda c: params.layout.tree(jnp.moveaxis(c, 0, -1)), tree)
+            for tree in columns
+        )
+        return call.out(estimate, batch.aux, error)
+
+    return g
+
+
+@_transform()
+def smooth_hvp(call: _Call) -> Callable:
+    r"""The product of the smoothed function's Hessian with a vector, without the Hessian.
+
+    $$ \nabla^2 F(\theta) \, v
+       \approx \frac{1}{N} \sum_i w_i (f_i - b_i) \, \frac{z_i (z_i \cdot v) - v}{\sigma^2} $$
+
+    The paper differences two smoothed gradients instead (eq. 23, printed with the wrong sign);
+    this is its limit, from the same evaluations.
+
+    Args:
+        fun: a function with a scalar output.
+        sigma: as for `smooth`.
+        **options: see `Options`; `argnums` counts the arguments of `fun`.
+
+    Returns:
+        `g(key, x, v, *other_args)` with `x, *other_args` the arguments of `fun` and `v` a vector
+        with the structure of the arguments that `argnums` names: the product, like `v`; with
+        `has_aux` and `stderr=True` as `smooth`.
+
+    Raises:
+        ValueError, TypeError: as `smooth`; an output that is no scalar; a `v` of another structure
+            or shape; `stderr=True` with a sigma of None.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, smoothdiff as sd
+        >>> f = lambda x: jnp.sum(jnp.round(x)) ** 2
+        >>> x = jnp.ones(3)
+        >>> sd.smooth_hvp(f, 0.5)(jax.random.key(0), x, x).shape
+        (3,)
+
+    Source: Stochastic Gradient Estimation for Higher-order Differentiable Rendering, eq. 22.
+    """
+
+    def g(key: Any, x: PyTree, v: PyTree, *other_args: Any) -> PyTree:
+        args = (x, *other_args)
+        params = call.params(args)
+        target = choose(args, call.argnums)
+        _check_vector(v, target)
+        if not call.stderr:
+
+            def gradient(target: PyTree) -> tuple[PyTree, PyTree]:
+                fun = partial(call.smoothed, scalar=True)
+                grad = jax.grad(fun, call.shifted_argnums(len(args)), has_aux=True)
+                return grad(key, *replace(args, call.argnums, target))
+
+            _, product, aux = jax.jvp(gradient, (target,), (v,), has_aux=True)
+            return call.out(product, aux)
+        call.only_smoothed(params, "stderr of a Hessian-vector product")
+        batch = call.batch(key, args, params, scalar=True)
+        operator = HessianOperator(batch, params.sigma, params.layout)
+        return call.out(operator.mv(v), batch.aux, operator.stderr(v))
+
+    return g
+
+
+def _check_vector(v: PyTree, target: PyTree) -> None:
+    def shape(tree: PyTree) -> PyTree:
+        return jax.tree.map(jnp.shape, tree)
+
+    if jax.tree.structure(v) != jax.tree.structure(target) or shape(v) != shape(target):
+        raise ValueError(
+            "v must have the structure and shapes of the parameters, "
+            f"{shape(target)}, not {shape(v)}: call g(key, x, v, *other_args)"
+        )
+
+
+@_transform()
+def smooth_quadratic(call: _Call) -> Callable:
+    r"""Value, gradient and Hessian operator of the smoothed function from one batch.
+
+    $$ F(\theta + p) \approx F(\theta) + \nabla F \cdot p + \tfrac12 p \cdot \nabla^2 F \, p $$
+
+    Args:
+        fun: a function with a scalar output.
+        sigma: as for `smooth`, but a positive width for every leaf.
+        **options: see `Options`.
+
+    Returns:
+        `g(key, x, *other_args)`: a `QuadraticModel`; with `has_aux` the pair of it and aux.
+        Products with its Hessian evaluate the function no more.
+
+    Raises:
+        ValueError, TypeError: as `smooth`; an output that is no scalar; a sigma of None.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, smoothdiff as sd
+        >>> f = lambda x: jnp.sum(jnp.round(x)) ** 2
+        >>> model = sd.smooth_quadratic(f, 0.5)(jax.random.key(0), jnp.ones(3))
+        >>> model.hessian.mv(model.grad).shape
+        (3,)
+
+    Source: Stochastic Gradient Estimation for Higher-order Differentiable Rendering, eq. 17-22.
+    """
+    if call.stderr:
+        raise ValueError("smooth_quadratic needs no stderr=True: use model.stderr, hessian_stderr")
+
+    def g(key: Any, *args: Any) -> PyTree:
+        params = call.params(args)
+        call.only_smoothed(params, "a quadratic model")
+        batch = call.batch(key, args, params, scalar=True)
+        aux, batch = batch.aux, batch.without_aux()
+        value, grad = jax.value_and_grad(lambda shift: combine(batch, shift))(
+            jnp.zeros_like(params.theta)
+        )
+        model = QuadraticModel(
+            value,
+            params.layout.tree(grad / params.sigma),
+            HessianOperator(batch, params.sigma, params.layout),
+        )
+        return call.out(model, aux)
+
+    return g

@@ -1,0 +1,133 @@
+r"""Standard errors: how far the independent groups of samples spread around their mean.
+
+Every estimate is a ratio of sums over groups, $\hat e = \sum_g s_g / \sum_g n_g$, with $n_g$
+samples in group g; its standard error is
+$\sqrt{\tfrac{G}{G-1} \sum_g (s_g - n_g \hat e)^2} / \sum_g n_g$.
+All is computed in units of sigma and of the largest residual, so that squares neither overflow nor
+vanish.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from smoothdiff._batch import Batch
+from smoothdiff._estimate import weights
+
+
+def value_stderr(batch: Batch, estimate: PyTree) -> PyTree:
+    """The standard error of the smoothed value, leaf by leaf."""
+
+    def leaf(values: Array, residual: Array, mean: Array) -> Array:
+        def sums(z, log_ratio, rows, shift):
+            # at zero displacement: w (f - b) + b, which is f itself for plain Gaussian points
+            value, rest = rows
+            w = weights(z, log_ratio, shift)[:, None].astype(value.dtype)
+            return w * rest + (value - rest)
+
+        rows = (values.reshape(len(values), -1), residual.reshape(len(values), -1))
+        flat = _spread(batch, sums, rows, mean.reshape(-1), jnp.max(jnp.abs(residual)))
+        return flat.reshape(mean.shape)
+
+    return jax.tree.map(leaf, batch.values, batch.control.residual, estimate)
+
+
+def jacobian_stderr(batch: Batch, estimate: PyTree) -> PyTree:
+    """The standard error of the derivative in units of sigma; leaves (..., n) like `estimate`."""
+
+    def leaf(residual: Array, mean: Array) -> Array:
+        rows = residual.reshape(len(residual), -1)
+        columns = mean.reshape(-1, mean.shape[-1]).T
+        scale = jnp.max(jnp.abs(residual))
+
+        def column(direction: Array, column_mean: Array) -> Array:
+            def sums(z, log_ratio, rows, shift):
+                tangent = jnp.broadcast_to(direction, shift.shape)
+                moved = lambda s: weights(z, log_ratio, s)[:, None].astype(rows.dtype) * rows
+                return jax.jvp(moved, (shift,), (tangent,))[1]
+
+            return _spread(batch, sums, rows, column_mean, scale)
+
+        n = mean.shape[-1]
+        out = jax.lax.map(lambda a: column(*a), (jnp.eye(n, dtype=batch.draws.dtype), columns))
+        return out.T.reshape(mean.shape)
+
+    return jax.tree.map(leaf, batch.control.residual, estimate)
+
+
+def grad_stderr(batch: Batch, estimate: Float[Array, " n"]) -> Float[Array, " n"]:
+    """The standard error of the gradient in units of sigma, for a scalar function."""
+    residual = batch.control.residual
+    sums = lambda z, log_ratio, rows, shift: _row_grad(z, log_ratio, rows)(shift)
+    return _spread(batch, sums, residual, estimate, jnp.max(jnp.abs(residual)))
+
+
+def hvp_stderr(
+    batch: Batch, direction: Float[Array, " n"], estimate: Float[Array, " n"]
+) -> Float[Array, " n"]:
+    """The standard error of the Hessian-vector product in units of sigma, for a scalar function."""
+    residual = batch.control.residual
+
+    def sums(z, log_ratio, rows, shift):
+        tangent = jnp.broadcast_to(direction, shift.shape)
+        return jax.jvp(_row_grad(z, log_ratio, rows), (shift,), (tangent,))[1]
+
+    return _spread(batch, sums, residual, estimate, jnp.max(jnp.abs(residual)))
+
+
+def free_grad_stderr(batch: Batch, per_row: Array) -> tuple[Array, Array]:
+    """Sum and standard error of a derivative by AD that is given in parts, one for each sample."""
+    flat = per_row.reshape(len(per_row), -1)
+    mean = jnp.sum(flat, axis=0)
+    rows = flat / batch.scale.astype(flat.dtype)
+    sums = lambda z, log_ratio, rows, shift: rows
+    error = _spread(batch, sums, rows, mean, jnp.max(jnp.abs(rows)))
+    return mean.reshape(per_row.shape[1:]), error.reshape(per_row.shape[1:])
+
+
+def _row_grad(z: Array, log_ratio: Array | None, rows: Array) -> Callable[[Array], Array]:
+    # each row has a displacement of its own, so one reverse pass gives the gradient of every row
+    def total(shift: Array) -> Array:
+        return jnp.sum(weights(z, log_ratio, shift).astype(rows.dtype) * rows)
+
+    return jax.grad(total)
+
+
+def _spread(batch: Batch, sums: Callable, rows: PyTree, mean: Array, scale: Array) -> Array:
+    """The standard error of a mean of rows `sums(z, log_ratio, rows, shift) -> (m, k)`."""
+    draws = batch.draws
+    group = draws.sampler.group(draws.num, draws.n)
+    count = -(-draws.num // group)
+    if count < 2:
+        raise ValueError(
+            f"a standard error needs at least two independent groups of samples, and {draws.num} "
+            f"samples of {draws.sampler} are one: raise num_samples"
+        )
+    safe = jnp.where(scale > 0, scale, 1).astype(mean.dtype)
+
+    def deviations(z, log_ratio, valid, rows) -> Array:
+        out = sums(z, log_ratio, rows, jnp.zeros(z.shape, z.dtype)).astype(mean.dtype)
+        away = (out - mean[None]) / safe
+        return away if valid is None else jnp.where(valid[:, None], away, 0)
+
+    if draws.chunk % group == 0:
+
+        def squares(start, z, log_ratio, part):
+            away = deviations(z, log_ratio, *part)
+            ids = jnp.arange(z.shape[0]) // group
+            sums = jax.ops.segment_sum(away, ids, num_segments=-(-z.shape[0] // group))
+            return jnp.sum(sums**2, axis=0)
+
+        total = draws.sum(squares, (batch.valid, rows))
+    else:
+        # groups longer than a chunk are few, so their sums can be kept
+        def by_group(start, z, log_ratio, part):
+            away = deviations(z, log_ratio, *part)
+            ids = (start + jnp.arange(z.shape[0])) // group
+            return jax.ops.segment_sum(away, ids, num_segments=count)
+
+        total = jnp.sum(draws.sum(by_group, (batch.valid, rows)) ** 2, axis=0)
+    error = jnp.sqrt(total * (count / (count - 1))) * safe
+    return error * batch.scale.astype(error.dtype)
