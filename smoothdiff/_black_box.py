@@ -1,0 +1,218 @@
+"""`black_box`: a host function of NumPy arrays as a JAX function, with faults that can be read."""
+
+import concurrent.futures
+import contextlib
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from smoothdiff._host_calls import HostFunction, Samples
+
+
+def black_box(
+    fun: Callable[..., Any],
+    out: PyTree,
+    *,
+    batched: bool = False,
+    executor: concurrent.futures.Executor | None = None,
+    on_error: str = "raise",
+    on_nonfinite: str = "raise",
+    retries: int = 0,
+    timeout: int | float | None = None,
+) -> Callable[..., Any]:
+    """Turns a host function of NumPy arrays, such as a renderer, into a JAX function.
+
+    The result works under `jax.jit`, `jax.vmap`, `jax.lax.scan`, `jax.lax.while_loop` and so on. It
+    has no derivative of its own: smooth it, with `smoothdiff.smooth` or one of its derivatives.
+
+    As for every JAX function, the value must follow from the arguments alone (pass a seed if there
+    is noise), and a value that nobody uses may never be computed. `fun` must not call JAX: a JAX
+    call inside a callback can hang.
+
+    Args:
+        fun: Called with positional arguments of the same structure as those of the JAX function,
+            their leaves read-only NumPy arrays.
+        out: What `fun` returns: a `jax.ShapeDtypeStruct`, a pytree of them, or an example. For one
+            sample, also when `batched`. 64-bit types are narrowed where JAX has them switched off.
+        batched: Whether `fun` takes a whole batch. Every leaf of its arguments then has one leading
+            axis, of the same size everywhere, and its results must have it too. The size is 1
+            outside `jax.vmap`; nested `jax.vmap` become one axis. If False, each sample is a call.
+        executor: Where single calls run, several at once; the order of the results is kept. Any
+            `concurrent.futures.Executor`. Processes must be spawned, as a fork of JAX can hang.
+        on_error: "raise", or "nan" so that a sample for which `fun` raises an exception or runs out
+            of time is NaN in every output (the whole batch if `batched`). `nonfinite="drop"` in the
+            transforms then leaves it out. A wrong structure, shape or dtype always raises.
+        on_nonfinite: "raise", or "nan" so that a sample with a NaN or an infinity in any of its
+            outputs is NaN in every output.
+        retries: How many times a call that failed is tried again. Takes no part in `on_nonfinite`.
+        timeout: Seconds that a call may take. Needs an `executor`. A call that cannot be cancelled
+            goes on in its worker, and keeps it busy.
+
+    Returns:
+        A JAX function with the name and docstring of `fun`.
+
+    Raises:
+        BlackBoxError: When it runs, if `fun` fails and this is not to become a NaN. Out of a
+            `jax.jit` of your own comes an error of JAX's (JaxRuntimeError or ValueError) with the
+            same message. What was turned into NaN is logged to "smoothdiff" at level INFO.
+        TypeError: If `fun`, `out` or `executor` is of the wrong type; later, if the function is
+            differentiated or called with a typed key.
+        ValueError: If the options contradict each other.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, numpy as np
+        >>> import smoothdiff as sd
+        >>> def stairs(x):
+        ...     return np.floor(x).sum()
+        >>> f = sd.black_box(stairs, jax.ShapeDtypeStruct((), jnp.float32))
+        >>> jax.jit(jax.vmap(f))(jnp.array([[0.5, 1.5], [2.5, 3.5]]))
+        Array([1., 5.], dtype=float32)
+    """
+    if not callable(fun):
+        raise TypeError(f"black_box needs a function of NumPy arrays, not {fun!r}")
+    specs, out_tree = jax.tree.flatten(jax.tree.map(_spec, out))
+    name = getattr(fun, "__name__", type(fun).__name__)
+    host = HostFunction(
+        fun, name, out_tree, batched, executor, on_error, on_nonfinite, retries, timeout
+    )
+    _check(host, specs)
+
+    @jax.custom_jvp
+    def call(*args):
+        leaves, tree = jax.tree.flatten(args)
+        shapes = tuple(
+            jax.ShapeDtypeStruct(spec.shape, jax.dtypes.canonicalize_dtype(spec.dtype))
+            for spec in specs
+        )
+        callback = _Callback(host, tree, tuple(leaf.ndim for leaf in leaves), shapes)
+        # Under vmap, however nested, one callback gets the whole batch.
+        results = jax.pure_callback(callback, shapes, *leaves, vmap_method="expand_dims")
+        return out_tree.unflatten(results)
+
+    # Only a tangent that arrives gets here; where the arguments are stopped, none does.
+    @call.defjvp
+    def no_derivative(primals, tangents):
+        raise TypeError(
+            f"the black box {name!r} has no derivative: smooth the function that calls it, for "
+            "example with sd.smooth(fun, sigma) or sd.smooth_grad(fun, sigma), "
+            "or stop the derivative with jax.lax.stop_gradient"
+        )
+
+    @functools.wraps(fun)
+    def box(*args):
+        # Outside of jit the error is ours to raise; while jit traces, neither line does anything.
+        with reraise():
+            return jax.block_until_ready(call(*jax.tree.map(_array, args)))
+
+    return box
+
+
+# What has been raised in a callback since each of the `reraise` blocks now open was entered.
+_open_blocks: dict[int, list[BaseException]] = {}
+
+
+@contextlib.contextmanager
+def reraise() -> Iterator[None]:
+    """Inside, what a black box raises arrives as itself: BlackBoxError with its cause, Ctrl-C.
+
+    Of every exception in a callback, even KeyboardInterrupt, JAX keeps only the text: it raises a
+    JaxRuntimeError or, from the second call of a jitted function on, a ValueError. By that text the
+    original is found again. It has to be put aside where this block and the callback, which may run
+    in a thread of JAX's, both see it, hence in the module; but only while a block is open. Results
+    must be awaited inside (`jax.block_until_ready`).
+    """
+    raised: list[BaseException] = []
+    _open_blocks[id(raised)] = raised
+    try:
+        yield
+    except (jax.errors.JaxRuntimeError, ValueError) as failure:
+        text = str(failure)
+        for error in reversed(raised):
+            if type(error).__name__ in text and str(error) in text:
+                raise error.with_traceback(None) from error.__cause__
+        raise
+    finally:
+        del _open_blocks[id(raised)]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Callback:
+    """What JAX calls. Equal for equal fields, so that calls outside of jit compile only once."""
+
+    host: HostFunction
+    tree: Any
+    ndims: tuple[int, ...]
+    shapes: tuple[jax.ShapeDtypeStruct, ...]
+
+    def __call__(self, *leaves: Any) -> list[np.ndarray]:
+        try:
+            samples = Samples(leaves, self.ndims, self.tree)
+            outs = [np.empty((len(samples), *out.shape), out.dtype) for out in self.shapes]
+            self.host(samples, outs)
+            return [out.reshape(samples.batch_shape + out.shape[1:]) for out in outs]
+        except BaseException as error:
+            for raised in list(_open_blocks.values()):
+                raised.append(error)
+            raise
+
+
+def _array(leaf: Any) -> jax.Array:
+    array = jnp.asarray(leaf)
+    if jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
+        raise TypeError(
+            "a host function cannot take a typed key: pass jax.random.key_data(key), or a seed"
+        )
+    return array
+
+
+def _spec(leaf: Any) -> jax.ShapeDtypeStruct:
+    """The shape and type of an output, from a ShapeDtypeStruct or an example."""
+    if not isinstance(leaf, jax.ShapeDtypeStruct | jax.Array):
+        leaf = np.asarray(leaf)
+    if not (jnp.issubdtype(leaf.dtype, jnp.number) or leaf.dtype == np.bool_):
+        raise TypeError(
+            "`out` must be a jax.ShapeDtypeStruct, an example array or number, or a pytree of "
+            f"them; one of its leaves is {leaf!r}"
+        )
+    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype)
+
+
+def _check(host: HostFunction, specs: list[jax.ShapeDtypeStruct]) -> None:
+    if not specs:
+        raise TypeError(
+            "`out` has no arrays in it; for a number write jax.ShapeDtypeStruct((), jnp.float32)"
+        )
+    for option in ("on_error", "on_nonfinite"):
+        value = getattr(host, option)
+        if value not in ("raise", "nan"):
+            raise ValueError(f'{option} must be "raise" or "nan", not {value!r}')
+        if value == "nan" and not all(jnp.issubdtype(spec.dtype, jnp.inexact) for spec in specs):
+            raise ValueError(
+                f'{option}="nan" needs every output to be of floats, as integers have no NaN: '
+                f'return floats, or write {option}="raise"'
+            )
+    if host.executor is not None and not isinstance(host.executor, concurrent.futures.Executor):
+        raise TypeError(
+            "executor must be a concurrent.futures.Executor, such as ThreadPoolExecutor(4) or "
+            f"client.get_executor() of a dask client, not {host.executor!r}"
+        )
+    if host.executor is not None and host.batched:
+        raise ValueError(
+            "batched=True makes one call of a whole batch, which an executor cannot share out: "
+            "leave out the executor, or write batched=False"
+        )
+    if host.timeout is not None and host.executor is None:
+        raise ValueError(
+            "timeout needs an executor that runs the calls, "
+            "for example executor=concurrent.futures.ThreadPoolExecutor(1)"
+        )
+    if host.timeout is not None and not host.timeout > 0:
+        raise ValueError(f"timeout must be a positive number of seconds, not {host.timeout!r}")
+    if host.retries < 0:
+        raise ValueError(f"retries must be 0 (a single try) or more, not {host.retries!r}")
