@@ -1,21 +1,20 @@
 """The public transforms: a function in, its smoothed value or a derivative of that out."""
 
-import inspect
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
-from functools import partial, wraps
-from typing import Any, Literal, Protocol, TypedDict, Unpack
+from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from smoothdiff._baselines import AbstractBaseline, as_baseline
-from smoothdiff._batch import Batch, evaluate
+from smoothdiff._baselines import as_baseline
+from smoothdiff._batch import Batch
+from smoothdiff._call import Call, transform
 from smoothdiff._estimate import combine, displacement
-from smoothdiff._params import Params, as_argnums, as_key, choose, replace, take_apart
+from smoothdiff._params import Params, choose, replace
 from smoothdiff._quadratic import HessianOperator, QuadraticModel
-from smoothdiff._samplers import AbstractSampler, Gaussian
+from smoothdiff._samplers import Gaussian
 from smoothdiff._stderr import (
     free_grad_stderr,
     grad_stderr,
@@ -24,170 +23,8 @@ from smoothdiff._stderr import (
 )
 
 
-class Options(TypedDict, total=False):
-    """What every transform takes beside the function and sigma, by keyword.
-
-    Args:
-        argnums: which of the function's arguments to smooth and differentiate, an int or a tuple.
-        num_samples: evaluations of the function in one call, all included.
-        sampler: where to sample, a sampler object such as `Gaussian(antithetic=True)`.
-        baseline: what to subtract: "none", "mean" (of the other samples), "center" (f(theta), one
-            evaluation) or a baseline object.
-        bounds: a pair (low, high), each a number or a pytree like the parameters. The function
-            sees points clamped to them; the weights see the points as drawn.
-        batch_size: evaluate and differentiate at most so many samples at a time, which bounds the
-            memory. The estimate is the same but for rounding.
-        nonfinite: "propagate" a NaN or infinite sample into the estimate, or "drop" it and
-            re-weight the others; NaN if fewer than half are left.
-        has_aux: the function returns (value, aux); aux comes back with one row per sample.
-        stderr: also return the standard error of the estimate.
-    """
-
-    argnums: int | Sequence[int]
-    num_samples: int
-    sampler: AbstractSampler
-    baseline: str | AbstractBaseline
-    bounds: tuple[PyTree, PyTree] | None
-    batch_size: int | None
-    nonfinite: Literal["propagate", "drop"]
-    has_aux: bool
-    stderr: bool
-
-
-@dataclass(frozen=True)
-class _Call:
-    """A function with its options checked, ready to be evaluated for given arguments."""
-
-    fun: Callable
-    sigma: Any
-    argnums: int | Sequence[int] = 0
-    num_samples: int = 64
-    sampler: AbstractSampler = Gaussian()  # noqa: RUF009 (a frozen module)
-    baseline: str | AbstractBaseline = "mean"
-    bounds: tuple[PyTree, PyTree] | None = None
-    batch_size: int | None = None
-    nonfinite: Literal["propagate", "drop"] = "propagate"
-    has_aux: bool = False
-    stderr: bool = False
-
-    def __post_init__(self):
-        if not callable(self.fun):
-            raise TypeError(f"the first argument must be a function, not {type(self.fun).__name__}")
-        if not isinstance(self.sampler, AbstractSampler):
-            raise TypeError(f"sampler must be a sampler object such as Gaussian(): {self.sampler}")
-        if self.nonfinite not in ("propagate", "drop"):
-            raise ValueError(f'nonfinite must be "propagate" or "drop", not {self.nonfinite!r}')
-        for name in ("num_samples", "batch_size"):
-            value = getattr(self, name)
-            if value is not None and (not isinstance(value, int) or value < 1):
-                raise ValueError(f"{name} must be a positive integer, not {value!r}")
-        extra = as_baseline(self.baseline).evaluations()
-        if self.num_samples <= extra:
-            raise ValueError(
-                f"num_samples={self.num_samples} leaves no samples: baseline={self.baseline!r} "
-                f"itself needs {extra}"
-            )
-
-    def options(self) -> Options:
-        """The options as a transform takes them."""
-        return {f.name: getattr(self, f.name) for f in fields(self)[2:]}  # pyright: ignore
-
-    def params(self, args: tuple) -> Params:
-        return take_apart(choose(args, self.argnums), self.sigma, self.bounds)
-
-    def batch(
-        self, key: Any, args: tuple, params: Params, *, scalar: bool, free_rows: list | None = None
-    ) -> Batch:
-        """One batch of evaluations; everything that a transform returns comes from it."""
-
-        def fun(theta: Array, free: list) -> tuple[PyTree, PyTree]:
-            out = self.fun(*replace(args, self.argnums, params.layout.tree(theta, free)))
-            value, aux = out if self.has_aux else (out, None)
-            value = jax.tree.map(jnp.asarray, value)
-            if scalar and not (isinstance(value, jax.Array) and value.shape == ()):
-                shape = jax.tree.map(jnp.shape, value)
-                raise TypeError(
-                    f"the function must return a scalar here, not an output of shape {shape}: use "
-                    "smooth_jacobian, or return a loss (jnp.sum, jnp.mean) of the output"
-                )
-            return value, aux
-
-        return evaluate(
-            fun,
-            params,
-            as_key(key),
-            num_samples=self.num_samples,
-            sampler=self.sampler,
-            baseline=as_baseline(self.baseline),
-            batch_size=self.batch_size,
-            nonfinite=self.nonfinite,
-            free_rows=free_rows,
-        )
-
-    def smoothed(self, key: Any, *args: Any, scalar: bool = False) -> tuple[PyTree, PyTree]:
-        """(value, aux) of the smoothed function; differentiating it is the whole library."""
-        params = self.params(args)
-        batch = self.batch(key, args, params, scalar=scalar)
-        return combine(batch, *displacement(params)), batch.aux
-
-    def shifted_argnums(self, num_args: int) -> int | tuple[int, ...]:
-        """Where the parameters stand among the arguments of the smoothed function, key first."""
-        chosen = tuple(i + 1 for i in as_argnums(self.argnums, num_args))
-        return chosen[0] if isinstance(self.argnums, int) else chosen
-
-    def only_smoothed(self, params: Params, what: str) -> None:
-        if params.free:
-            raise ValueError(
-                f"{what} needs a sigma for every leaf: leave the leaves with sigma None out of "
-                "argnums, or pass them as other arguments"
-            )
-
-    def out(self, estimate: PyTree, aux: PyTree, error: PyTree = None) -> PyTree:
-        """The estimate in the form that the options ask for."""
-        result = (estimate, aux) if self.has_aux else estimate
-        return (result, error) if self.stderr else result
-
-
-class _Transform(Protocol):
-    def __call__(
-        self, fun: Callable[..., Any], sigma: PyTree, **options: Unpack[Options]
-    ) -> Callable[..., Any]: ...
-
-
-def _transform(**defaults: Any) -> Callable[[Callable[[_Call], Callable]], _Transform]:
-    """Gives a transform its options: defaults of its own, checks, and a signature that shows them.
-
-    The decorated function receives a `_Call` and returns the function that users call.
-    """
-
-    def decorate(make: Callable[[_Call], Callable]) -> _Transform:
-        known = {f.name: f.default for f in fields(_Call)[2:]} | defaults
-
-        @wraps(make)
-        def transform(fun: Callable, sigma: PyTree, **options: Unpack[Options]) -> Callable:
-            unknown = sorted(set(options) - set(known))
-            if unknown:
-                raise TypeError(f"{make.__name__} has no option {unknown}; it has {sorted(known)}")
-            call = _Call(fun, sigma, **{**known, **options})
-            return make(call)
-
-        hints = Options.__annotations__
-        kind = inspect.Parameter
-        shown = [kind("fun", kind.POSITIONAL_OR_KEYWORD, annotation=Callable)]
-        shown += [kind("sigma", kind.POSITIONAL_OR_KEYWORD, annotation=PyTree)]
-        shown += [
-            kind(name, kind.KEYWORD_ONLY, default=default, annotation=hints[name])
-            for name, default in known.items()
-        ]
-        signature = inspect.Signature(shown, return_annotation=Callable)
-        transform.__signature__ = signature  # pyright: ignore[reportAttributeAccessIssue]
-        return transform
-
-    return decorate
-
-
-@_transform(sampler=Gaussian(antithetic=True))
-def smooth(call: _Call) -> Callable:
+@transform(sampler=Gaussian(antithetic=True))
+def smooth(call: Call) -> Callable:
     r"""The function convolved with a Gaussian, as a function of a key that JAX can differentiate.
 
     $$ F(\theta) = \mathbb{E}_{z \sim \mathcal{N}(0, I)}[f(\theta + \sigma z)] $$
@@ -233,8 +70,8 @@ def smooth(call: _Call) -> Callable:
     return g
 
 
-@_transform(sampler=Gaussian(antithetic=True))
-def smooth_value_and_grad(call: _Call) -> Callable:
+@transform(sampler=Gaussian(antithetic=True))
+def smooth_value_and_grad(call: Call) -> Callable:
     r"""Value and gradient of the smoothed function from one batch, like `jax.value_and_grad`.
 
     See [`smooth_grad`][smoothdiff.smooth_grad] for the equation.
@@ -276,8 +113,8 @@ def smooth_value_and_grad(call: _Call) -> Callable:
     return g
 
 
-@_transform(sampler=Gaussian(antithetic=True))
-def smooth_grad(call: _Call) -> Callable:
+@transform(sampler=Gaussian(antithetic=True))
+def smooth_grad(call: Call) -> Callable:
     r"""The gradient of the smoothed function, like `jax.grad`.
 
     $$ \nabla F(\theta) = \frac1\sigma \mathbb{E}[f(\theta + \sigma z) \, z]
@@ -314,7 +151,7 @@ def smooth_grad(call: _Call) -> Callable:
     return g
 
 
-def _first_order(call: _Call, key: Any, args: tuple, params: Params) -> tuple:
+def _first_order(call: Call, key: Any, args: tuple, params: Params) -> tuple:
     """(value, aux, grad, (value_stderr, grad_stderr)) from one batch."""
     copies = None
     if params.free:
@@ -346,8 +183,8 @@ def _first_order(call: _Call, key: Any, args: tuple, params: Params) -> tuple:
     )
 
 
-@_transform(sampler=Gaussian(antithetic=True))
-def smooth_jacobian(call: _Call) -> Callable:
+@transform(sampler=Gaussian(antithetic=True))
+def smooth_jacobian(call: Call) -> Callable:
     r"""The Jacobian of the smoothed function, like `jax.jacfwd` and `jax.jacrev`.
 
     $$ \frac{\partial F_p}{\partial \theta_j}
@@ -377,7 +214,7 @@ def smooth_jacobian(call: _Call) -> Callable:
     def g(key: Any, *args: Any) -> PyTree:
         params = call.params(args)
         if not call.stderr:
-            outputs = jax.eval_shape(call.smoothed, key, *args)[0]
+            outputs = jax.eval_shape(lambda: call.smoothed(key, *args)[0])
             size = sum(leaf.size for leaf in jax.tree.leaves(outputs))
             # forward mode has one pass per parameter, reverse mode one per output
             jacobian = jax.jacfwd if params.theta.size <= size else jax.jacrev
@@ -400,8 +237,8 @@ def smooth_jacobian(call: _Call) -> Callable:
     return g
 
 
-@_transform()
-def smooth_hessian(call: _Call) -> Callable:
+@transform()
+def smooth_hessian(call: Call) -> Callable:
     r"""The Hessian of the smoothed function, like `jax.hessian`.
 
     $$ \nabla^2 F(\theta)
@@ -458,8 +295,8 @@ def smooth_hessian(call: _Call) -> Callable:
     return g
 
 
-@_transform()
-def smooth_hvp(call: _Call) -> Callable:
+@transform()
+def smooth_hvp(call: Call) -> Callable:
     r"""The product of the smoothed function's Hessian with a vector, without the Hessian.
 
     $$ \nabla^2 F(\theta) \, v
@@ -525,8 +362,8 @@ def _check_vector(v: PyTree, target: PyTree) -> None:
         )
 
 
-@_transform()
-def smooth_quadratic(call: _Call) -> Callable:
+@transform()
+def smooth_quadratic(call: Call) -> Callable:
     r"""Value, gradient and Hessian operator of the smoothed function from one batch.
 
     $$ F(\theta + p) \approx F(\theta) + \nabla F \cdot p + \tfrac12 p \cdot \nabla^2 F \, p $$

@@ -1,0 +1,180 @@
+"""One call of a transform: its options, their checks, and the way to its batch and value."""
+
+import inspect
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from functools import wraps
+from typing import Any, Literal, Protocol, TypedDict, Unpack, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from smoothdiff._baselines import AbstractBaseline, as_baseline
+from smoothdiff._batch import Batch, evaluate
+from smoothdiff._estimate import combine, displacement
+from smoothdiff._params import Params, as_argnums, as_key, choose, replace, take_apart
+from smoothdiff._samplers import AbstractSampler, Gaussian
+
+
+class Options(TypedDict, total=False):
+    """What every transform takes beside the function and sigma, by keyword.
+
+    Args:
+        argnums: which of the function's arguments to smooth and differentiate, an int or a tuple.
+        num_samples: evaluations of the function in one call, all included.
+        sampler: where to sample, a sampler object such as `Gaussian(antithetic=True)`.
+        baseline: what to subtract: "none", "mean" (of the other samples), "center" (f(theta), one
+            evaluation) or a baseline object.
+        bounds: a pair (low, high), each a number or a pytree like the parameters. The function
+            sees points clamped to them; the weights see the points as drawn.
+        batch_size: evaluate and differentiate at most so many samples at a time, which bounds the
+            memory. The estimate is the same but for rounding.
+        nonfinite: "propagate" a NaN or infinite sample into the estimate, or "drop" it and
+            re-weight the others; NaN if fewer than half are left.
+        has_aux: the function returns (value, aux); aux comes back with one row per sample.
+        stderr: also return the standard error of the estimate.
+    """
+
+    argnums: int | Sequence[int]
+    num_samples: int
+    sampler: AbstractSampler
+    baseline: str | AbstractBaseline
+    bounds: tuple[PyTree, PyTree] | None
+    batch_size: int | None
+    nonfinite: Literal["propagate", "drop"]
+    has_aux: bool
+    stderr: bool
+
+
+@dataclass(frozen=True)
+class Call:
+    """A function with its options checked, ready to be evaluated for given arguments."""
+
+    fun: Callable
+    sigma: Any
+    argnums: int | Sequence[int] = 0
+    num_samples: int = 64
+    sampler: AbstractSampler = Gaussian()  # noqa: RUF009 (a frozen module)
+    baseline: str | AbstractBaseline = "mean"
+    bounds: tuple[PyTree, PyTree] | None = None
+    batch_size: int | None = None
+    nonfinite: Literal["propagate", "drop"] = "propagate"
+    has_aux: bool = False
+    stderr: bool = False
+
+    def __post_init__(self):
+        if not callable(self.fun):
+            raise TypeError(f"the first argument must be a function, not {type(self.fun).__name__}")
+        if not isinstance(self.sampler, AbstractSampler):
+            raise TypeError(f"sampler must be a sampler object such as Gaussian(): {self.sampler}")
+        if self.nonfinite not in ("propagate", "drop"):
+            raise ValueError(f'nonfinite must be "propagate" or "drop", not {self.nonfinite!r}')
+        for name in ("num_samples", "batch_size"):
+            value = getattr(self, name)
+            if value is not None and (not isinstance(value, int) or value < 1):
+                raise ValueError(f"{name} must be a positive integer, not {value!r}")
+        extra = as_baseline(self.baseline).evaluations()
+        if self.num_samples <= extra:
+            raise ValueError(
+                f"num_samples={self.num_samples} leaves no samples: baseline={self.baseline!r} "
+                f"itself needs {extra}"
+            )
+
+    def options(self) -> Options:
+        """The options as a transform takes them."""
+        return {f.name: getattr(self, f.name) for f in fields(self)[2:]}  # pyright: ignore
+
+    def params(self, args: tuple) -> Params:
+        return take_apart(choose(args, self.argnums), self.sigma, self.bounds)
+
+    def batch(
+        self, key: Any, args: tuple, params: Params, *, scalar: bool, free_rows: list | None = None
+    ) -> Batch:
+        """One batch of evaluations; everything that a transform returns comes from it."""
+
+        def fun(theta: Array, free: list) -> tuple[PyTree, PyTree]:
+            out = self.fun(*replace(args, self.argnums, params.layout.tree(theta, free)))
+            value, aux = out if self.has_aux else (out, None)
+            value = jax.tree.map(jnp.asarray, value)
+            if scalar and not (isinstance(value, jax.Array) and value.shape == ()):
+                shape = jax.tree.map(jnp.shape, value)
+                raise TypeError(
+                    f"the function must return a scalar here, not an output of shape {shape}: use "
+                    "smooth_jacobian, or return a loss (jnp.sum, jnp.mean) of the output"
+                )
+            return value, aux
+
+        return evaluate(
+            fun,
+            params,
+            as_key(key),
+            num_samples=self.num_samples,
+            sampler=self.sampler,
+            baseline=as_baseline(self.baseline),
+            batch_size=self.batch_size,
+            nonfinite=self.nonfinite,
+            free_rows=free_rows,
+        )
+
+    def smoothed(self, key: Any, *args: Any, scalar: bool = False) -> tuple[PyTree, PyTree]:
+        """(value, aux) of the smoothed function; differentiating it is the whole library."""
+        params = self.params(args)
+        batch = self.batch(key, args, params, scalar=scalar)
+        return combine(batch, *displacement(params)), batch.aux
+
+    def shifted_argnums(self, num_args: int) -> int | tuple[int, ...]:
+        """Where the parameters stand among the arguments of the smoothed function, key first."""
+        chosen = tuple(i + 1 for i in as_argnums(self.argnums, num_args))
+        return chosen[0] if isinstance(self.argnums, int) else chosen
+
+    def only_smoothed(self, params: Params, what: str) -> None:
+        if params.free:
+            raise ValueError(
+                f"{what} needs a sigma for every leaf: leave the leaves with sigma None out of "
+                "argnums, or pass them as other arguments"
+            )
+
+    def out(self, estimate: PyTree, aux: PyTree, error: PyTree = None) -> PyTree:
+        """The estimate in the form that the options ask for."""
+        result = (estimate, aux) if self.has_aux else estimate
+        return (result, error) if self.stderr else result
+
+
+@runtime_checkable
+class Transform(Protocol):
+    def __call__(
+        self, fun: Callable[..., Any], sigma: PyTree, **options: Unpack[Options]
+    ) -> Callable[..., Any]: ...
+
+
+def transform(**defaults: Any) -> Callable[[Callable[[Call], Callable]], Transform]:
+    """Gives a transform its options: defaults of its own, checks, and a signature that shows them.
+
+    The decorated function receives a `Call` and returns the function that users call.
+    """
+
+    def decorate(make: Callable[[Call], Callable]) -> Transform:
+        known = {f.name: f.default for f in fields(Call)[2:]} | defaults
+
+        @wraps(make)
+        def with_options(fun: Callable, sigma: PyTree, **options: Unpack[Options]) -> Callable:
+            unknown = sorted(set(options) - set(known))
+            if unknown:
+                raise TypeError(f"{make.__name__} has no option {unknown}; it has {sorted(known)}")
+            call = Call(fun, sigma, **{**known, **options})
+            return make(call)
+
+        hints = Options.__annotations__
+        kind = inspect.Parameter
+        shown = [kind("fun", kind.POSITIONAL_OR_KEYWORD, annotation=Callable)]
+        shown += [kind("sigma", kind.POSITIONAL_OR_KEYWORD, annotation=PyTree)]
+        shown += [
+            kind(name, kind.KEYWORD_ONLY, default=default, annotation=hints[name])
+            for name, default in known.items()
+        ]
+        signature = inspect.Signature(shown, return_annotation=Callable)
+        with_options.__signature__ = signature  # pyright: ignore[reportAttributeAccessIssue]
+        return with_options
+
+    return decorate
