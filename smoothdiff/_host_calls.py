@@ -20,8 +20,9 @@ _log = logging.getLogger("smoothdiff")
 class BlackBoxError(RuntimeError):
     """A host function failed. The message names it, its arguments and the original error.
 
-    `smoothdiff.black_box` raises it, and `smoothdiff.minimise` too. Out of a `jax.jit` of your own
-    comes an error of JAX's, which has the same message in its text.
+    A `smoothdiff.black_box` raises it; it is what `smoothdiff.minimise` reports in its
+    `MinimiseError`. Out of a `jax.jit` of your own comes an error of JAX's, which has the same
+    message in its text.
     """
 
 

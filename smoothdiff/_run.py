@@ -1,0 +1,272 @@
+"""One run of a solver on the host: compiled steps, their history, and what is returned or kept."""
+
+import dataclasses
+import operator
+import os
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Bool, PyTree
+
+from smoothdiff._black_box import reraise
+from smoothdiff._checkpoint import Checkpoint
+from smoothdiff._solvers import AbstractSmoothSolver, Progress
+
+_DEFAULT_STEPS = 256
+# the share of the time that saving may take
+_SAVING = 0.05
+_NONFINITE = (
+    "an estimate was NaN or infinite; `result` has what was found before. If fun fails for some "
+    'samples, give the solver nonfinite="drop", which leaves them out as long as half are finite; '
+    "if the iterates run away, take smaller steps or set bounds"
+)
+
+
+class Record(NamedTuple):
+    """One step of `minimise`, in Python numbers and NumPy arrays.
+
+    Attributes:
+        step: which step, from 1.
+        evaluations: evaluations of the function so far.
+        seconds: time since the start, compilation included; a resumed run counts on.
+        fun: the smoothed function where the step started, as its batch estimated it.
+        stderr: the standard error of `fun`; NaN where the batch cannot tell.
+        sigma: the smoothing width of the step, the widest if there are several.
+        y: the iterate after the step.
+    """
+
+    step: int
+    evaluations: int
+    seconds: float
+    fun: float
+    stderr: float
+    sigma: float
+    y: PyTree[np.ndarray]
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """What `minimise` found.
+
+    Attributes:
+        y: the best point, judged on fresh samples. If the run was cut short ("interrupted", or an
+            error) there were none: then the point of lowest estimate, which may be luck.
+        fun: the smoothed function there.
+        stderr: the standard error of `fun`.
+        evaluations: evaluations of the function, the judgement included; not those of a step that
+            was broken off.
+        reason: why the run stopped: "max_steps", "max_evaluations", "callback", "interrupted", or
+            what the solver says, such as "converged"; in an error "nonfinite" or "failed".
+        history: one `Record` for each step.
+    """
+
+    y: PyTree[Array]
+    fun: float
+    stderr: float
+    evaluations: int
+    reason: str
+    history: list[Record] = dataclasses.field(repr=False)
+
+
+class MinimiseError(RuntimeError):
+    """A run failed: `result` is what it had found, `__cause__` what a black box raised."""
+
+    def __init__(self, message: str, result: Result):
+        super().__init__(message)
+        self.result = result
+
+
+class Problem(eqx.Module):
+    """What the steps have in common; its methods are the solver's, compiled."""
+
+    fun: Callable[[PyTree, PyTree], Any]
+    solver: Any
+    args: PyTree
+    options: dict[str, Any]
+
+    def _fn(self, y: PyTree, args: PyTree) -> tuple[Array, None]:
+        return jnp.asarray(self.fun(y, args)), None
+
+    @eqx.filter_jit
+    def value(self, y: PyTree) -> Array:
+        return self._fn(y, self.args)[0]
+
+    def init(self, y: PyTree) -> Any:
+        """The first state. Not compiled, so that the solver can look at values and refuse them."""
+        out = jax.eval_shape(lambda y: self.value(y), y)
+        if out.shape != () or not jnp.issubdtype(out.dtype, jnp.floating):
+            raise TypeError(
+                f"fun returned shape {out.shape} and dtype {out.dtype}; it must return one real "
+                "floating-point number: use jnp.mean(...) or .astype(float)"
+            )
+        state = self.solver.init(self._fn, y, self.args, self.options, out, None, frozenset())
+        # weak types would compile the second step anew
+        return jax.tree.map(lambda a: jnp.asarray(a, a.dtype), state)
+
+    @eqx.filter_jit
+    def step(self, y: PyTree, state: Any) -> tuple[PyTree, Any]:
+        # a loop of one step, since XLA rounds the body of a loop otherwise than the bare step: this
+        # gives optimistix's iterates to the last bit
+        def body(carry: tuple[PyTree, Any]) -> tuple[PyTree, Any]:
+            y, state = carry
+            step = self.solver.step
+            y, state, _ = step(self._fn, y, self.args, self.options, state, frozenset())
+            return y, state
+
+        before = state.progress.step
+        return jax.lax.while_loop(lambda c: c[1].progress.step == before, body, (y, state))
+
+    @eqx.filter_jit
+    def done(self, y: PyTree, state: Any) -> Bool[Array, ""]:
+        return self.solver.terminate(self._fn, y, self.args, self.options, state, frozenset())[0]
+
+    @eqx.filter_jit
+    def judge(self, y: PyTree, state: Any) -> tuple[PyTree, dict[str, Any]]:
+        result = optx.RESULTS.successful
+        y, _, stats = self.solver.postprocess(
+            self._fn, y, None, self.args, self.options, state, frozenset(), result
+        )
+        return y, stats
+
+
+@dataclasses.dataclass
+class Run:
+    """Where a run stands: at every moment something that can be returned or saved."""
+
+    problem: Problem
+    y: PyTree
+    state: Any
+    history: list[Record] = dataclasses.field(default_factory=list)
+    start: float = dataclasses.field(default_factory=time.monotonic)
+    file: Checkpoint | None = None
+    save_due: float = 0.0
+
+    @property
+    def steps(self) -> int:
+        return int(self.state.progress.step)
+
+    @property
+    def evaluations(self) -> int:
+        return int(self.state.progress.evaluations)
+
+    def attach(self, path: str | os.PathLike) -> None:
+        """Keeps the run in a file from now on, and takes up the one that is already there."""
+        problem = self.problem
+        shapes = jax.tree.map(lambda a: f"{a.dtype}{a.shape}", self.state)
+        self.file = Checkpoint(
+            path,
+            fun=problem.fun,
+            y0=self.y,
+            args=problem.args,
+            solver=(problem.solver, shapes),
+            **({"bounds": None} | problem.options),
+        )
+        saved = self.file.load((self.y, self.state, Record(0, 0, 0.0, 0.0, 0.0, 0.0, self.y)))
+        if saved is not None:
+            self.y, self.state = jax.tree.map(jnp.asarray, saved[:2])
+            self.history = _unstack(saved[2])
+            self.start -= self.history[-1].seconds
+
+    def save(self) -> None:
+        if self.file is None or self.steps == 0:
+            return
+        before = time.monotonic()
+        history = jax.tree.map(lambda *leaves: np.stack(leaves), *self.history[: self.steps])
+        self.file.save((self.y, self.state, history))
+        after = time.monotonic()
+        self.save_due = after + (after - before) / _SAVING
+
+    def done(self) -> str | None:
+        """Why the solver wants to stop, if it does."""
+        done = self.problem.done(self.y, self.state)
+        return self.problem.solver.reason(self.state) if done else None
+
+    def step(self) -> Record:
+        """Takes a step and keeps it, unless it failed."""
+        with reraise():
+            y, state = jax.block_until_ready(self.problem.step(self.y, self.state))
+        progress = state.progress
+        if not progress.finite:
+            raise MinimiseError(_NONFINITE, self.found("nonfinite", progress))
+        record = Record(
+            step=progress.step.item(),
+            evaluations=progress.evaluations.item(),
+            seconds=time.monotonic() - self.start,
+            fun=progress.fun.item(),
+            stderr=progress.stderr.item(),
+            sigma=progress.sigma.item(),
+            y=jax.device_get(y),
+        )
+        # Ctrl-C may come between any two lines: the state has the last word on what was done
+        self.history.append(record)
+        self.y, self.state = y, state
+        if time.monotonic() >= self.save_due:
+            self.save()
+        return record
+
+    def judged(self, reason: str) -> Result:
+        """The result of a run that ended well."""
+        with reraise():
+            y, stats = jax.block_until_ready(self.problem.judge(self.y, self.state))
+        if not jnp.isfinite(stats["fun"]):
+            raise MinimiseError(_NONFINITE, self.found("nonfinite"))
+        fun, stderr, evaluations = (stats[name].item() for name in ("fun", "stderr", "evaluations"))
+        return Result(y, fun, stderr, evaluations, reason, self.history)
+
+    def found(self, reason: str, progress: Progress | None = None) -> Result:
+        """The result of a run that was cut short: no evaluation is made for it."""
+        p = progress or self.state.progress
+        fun, stderr, evaluations = (a.item() for a in (p.best_fun, p.best_stderr, p.evaluations))
+        return Result(p.best_y, fun, stderr, evaluations, reason, self.history[: self.steps])
+
+
+class Limits(NamedTuple):
+    """The most steps, and the most evaluations after which there is still room for a step."""
+
+    steps: int | None
+    evaluations: int | None
+    expected: int | None
+
+    @staticmethod
+    def of(
+        solver: AbstractSmoothSolver,
+        y: PyTree,
+        max_steps: int | None,
+        max_evaluations: int | None,
+    ) -> "Limits":
+        if max_evaluations is None:
+            steps = _DEFAULT_STEPS if max_steps is None else max_steps
+            return Limits(steps, None, steps)
+        step, final = solver.evaluations_per_step(y), solver.final_evaluations(y)
+        room = max_evaluations - final - step
+        if room < 0:
+            raise ValueError(
+                f"max_evaluations={max_evaluations} leaves no room: a step takes {step}, judging "
+                f"the result {final}. Allow {step + final}, or lower the solver's num_samples"
+            )
+        fit = room // step + 1
+        return Limits(max_steps, room, fit if max_steps is None else min(fit, max_steps))
+
+    def reached(self, run: Run) -> str | None:
+        if self.steps is not None and run.steps >= self.steps:
+            return "max_steps"
+        if self.evaluations is not None and run.evaluations > self.evaluations:
+            return "max_evaluations"
+        return None
+
+
+def inexact(leaf: Any) -> Array:
+    leaf = jnp.asarray(leaf)
+    return leaf if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf.astype(float)
+
+
+def _unstack(records: Record) -> list[Record]:
+    rows = zip(*(np.asarray(column).tolist() for column in records[:-1]), strict=True)
+    at = lambda i: jax.tree.map(operator.itemgetter((i, ...)), records.y)
+    return [Record._make((*row, at(i))) for i, row in enumerate(rows)]

@@ -1,0 +1,25 @@
+"""Solvers: optimistix's interface, and what `sd.minimise` needs beyond it.
+
+A solver is an `AbstractSmoothSolver` and one of optimistix's abstract solvers, so that the same
+object runs inside `optimistix.minimise(fun, solver, y0, options={"key": key})` and, with the same
+iterates, one step at a time under `smoothdiff.minimise`. What both rely on:
+
+* The options are `"key"` and, optionally, `"bounds"` (`read_options`). The random numbers of a step
+  come from `jax.random.fold_in(key, progress.step)` and from nothing else.
+* The state is an `eqx.Module` of arrays, of the same shapes and dtypes at every step, with a field
+  `progress: Progress`. No typed keys, Python numbers or operators are in it.
+* `init` evaluates nothing. `sd.minimise` calls it with concrete values: it refuses bad ones.
+* `step` makes at most `evaluations_per_step(y)` evaluations and counts them in its progress. When
+  the estimate or the new iterate is not finite, it returns the old iterate and a progress whose
+  `finite` is False.
+* `terminate` depends on the state alone, and with `finite` False gives `RESULTS.nonfinite`;
+  `reason(state)` says in a word why it asked to stop.
+* `postprocess` makes at most `final_evaluations(y)` evaluations, to judge its candidates on fresh
+  samples (`judge`). It returns the statistics `fun` and `stderr` of the winner, and `evaluations`,
+  those of the whole run.
+"""
+
+from smoothdiff._solvers._base import AbstractSmoothSolver, Progress
+from smoothdiff._solvers.first_order import FirstOrder
+
+__all__ = ["AbstractSmoothSolver", "FirstOrder", "Progress"]

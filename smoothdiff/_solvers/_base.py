@@ -1,0 +1,133 @@
+"""What the solvers share: progress that a host loop can read, options, a last judgement."""
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from smoothdiff._params import as_key
+
+
+class Progress(eqx.Module):
+    """What a solver has done so far, in arrays only, as the field `progress` of its state.
+
+    `fun`, `stderr` and `sigma` belong to the last batch, `best_*` to the lowest estimate so far:
+    lowest by luck as much as by merit, hence a candidate and no answer. `finite` turns False when
+    a step failed; the iterate is then the one from before that step.
+    """
+
+    step: Int[Array, ""]
+    evaluations: Int[Array, ""]
+    fun: Float[Array, ""]
+    stderr: Float[Array, ""]
+    sigma: Float[Array, ""]
+    finite: Bool[Array, ""]
+    best_y: PyTree[Array]
+    best_fun: Float[Array, ""]
+    best_stderr: Float[Array, ""]
+
+    @staticmethod
+    def start(y: PyTree[Array], dtype: Any) -> "Progress":
+        """Nothing done yet: any estimate is better than infinity."""
+        unknown = jnp.asarray(jnp.inf, dtype)
+        count = jnp.asarray(0, jnp.int32)
+        good = jnp.asarray(True)
+        return Progress(count, count, unknown, unknown, unknown, good, y, unknown, unknown)
+
+    def after(
+        self,
+        y: PyTree[Array],
+        fun: Float[Array, ""],
+        stderr: Float[Array, ""],
+        sigma: PyTree,
+        evaluations: int | Int[Array, ""],
+        finite: Bool[Array, ""],
+    ) -> "Progress":
+        """The progress after one more step, whose batch estimated the function at `y`."""
+        dtype = self.fun.dtype
+        fun, stderr = fun.astype(dtype), stderr.astype(dtype)
+        widths = [jnp.max(jnp.asarray(s)).astype(dtype) for s in jax.tree.leaves(sigma)]
+        better = finite & (fun < self.best_fun)
+        best = (y, fun, stderr), (self.best_y, self.best_fun, self.best_stderr)
+        best_y, best_fun, best_stderr = jax.tree.map(lambda a, b: jnp.where(better, a, b), *best)
+        return Progress(
+            step=self.step + 1,
+            evaluations=self.evaluations + evaluations,
+            fun=fun,
+            stderr=stderr,
+            sigma=jnp.max(jnp.stack(widths)),
+            finite=finite,
+            best_y=best_y,
+            best_fun=best_fun,
+            best_stderr=best_stderr,
+        )
+
+
+class AbstractSmoothSolver(eqx.Module):
+    """What a solver adds to optimistix's interface, so that `sd.minimise` can run it.
+
+    The package's docstring states the whole contract.
+    """
+
+    @abc.abstractmethod
+    def evaluations_per_step(self, y: PyTree[Array]) -> int:
+        """The most evaluations of the function that one `step` makes."""
+
+    @abc.abstractmethod
+    def final_evaluations(self, y: PyTree[Array]) -> int:
+        """The most evaluations of the function that `postprocess` makes."""
+
+    def reason(self, state: Any) -> str:
+        """One word for why `terminate` asked to stop; called on the host, with a concrete state."""
+        return "converged"
+
+
+def read_options(options: dict[str, Any]) -> tuple[Array, tuple[PyTree, PyTree] | None]:
+    """The key and the bounds (or None) from the options of a solver."""
+    unknown = set(options) - {"key", "bounds"}
+    if unknown:
+        raise ValueError(f'options has unknown entries {sorted(unknown)}: use "key" and "bounds"')
+    if options.get("key") is None:
+        raise ValueError(
+            "the solver draws random samples and needs a key: pass "
+            'options={"key": jax.random.key(0)} to optimistix, or key= to sd.minimise'
+        )
+    return as_key(options["key"]), options.get("bounds")
+
+
+def project(y: PyTree[Array], bounds: tuple[PyTree, PyTree] | None) -> PyTree[Array]:
+    """The point within the bounds that is nearest to `y`; a side that is None is open."""
+    if bounds is None:
+        return y
+    leaves, treedef = jax.tree.flatten(y)
+    for side, limit in zip(bounds, (jnp.maximum, jnp.minimum), strict=True):
+        full = jax.tree.broadcast(side, y, is_leaf=lambda b: b is None)
+        sides = treedef.flatten_up_to(full)
+        leaves = [
+            leaf if b is None else limit(leaf, jnp.broadcast_to(b, leaf.shape).astype(leaf.dtype))
+            for leaf, b in zip(leaves, sides, strict=True)
+        ]
+    return treedef.unflatten(leaves)
+
+
+def all_finite(tree: PyTree[Array]) -> Bool[Array, ""]:
+    """Whether there is no NaN and no infinity in any leaf."""
+    return jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]).all()
+
+
+def judge(
+    estimate: Callable[[PyTree[Array]], tuple[Array, Array]], *candidates: PyTree[Array]
+) -> tuple[PyTree[Array], Array, Array]:
+    """The candidate with the lowest fresh estimate, with that estimate and its standard error.
+
+    `estimate(y)` returns both, and sees the same random numbers for every candidate, so that they
+    cancel from the comparison. A candidate without a finite estimate loses; ties go to the first.
+    """
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *candidates)
+    funs, stderrs = jax.lax.map(estimate, stacked)
+    winner = jnp.argmin(jnp.where(jnp.isfinite(funs), funs, jnp.inf))
+    return jax.tree.map(lambda leaf: leaf[winner], stacked), funs[winner], stderrs[winner]

@@ -1,0 +1,220 @@
+"""First order: any optax transformation, driven by the gradient of the smoothed function."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from smoothdiff._baselines import AbstractBaseline
+from smoothdiff._named_baselines import as_baseline
+from smoothdiff._params import take_apart
+from smoothdiff._samplers import AbstractSampler, Gaussian
+from smoothdiff._smooth import smooth
+from smoothdiff._solvers._base import (
+    AbstractSmoothSolver,
+    Progress,
+    all_finite,
+    judge,
+    project,
+    read_options,
+)
+
+# so many small updates in a row count as convergence: under noise a single one is luck
+_PATIENCE = 5
+# the share of the newest iterate in the running average
+_NEWEST = 0.1
+# optax and norms mix dtypes (Adam raises a float to an integer), whatever the user's setting
+_promotion = partial(jax.numpy_dtype_promotion, "standard")
+
+
+class FirstOrderState(eqx.Module):
+    """The state of `FirstOrder`: with an average of the iterates and a count of small updates."""
+
+    progress: Progress
+    opt_state: PyTree
+    average: PyTree[Array]
+    quiet: Int[Array, ""]
+
+
+class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
+    r"""Gradient descent on the smoothed function, by any optax transformation.
+
+    $$ y_{t+1} = \Pi\left(y_t + u_t\right), \qquad
+       u_t = \text{optax}\left(\hat\nabla F_{\sigma_t}(y_t)\right), $$
+
+    with $\Pi$ the projection onto the bounds, and one batch of `num_samples` evaluations a step for
+    the gradient, the value and its standard error. The point returned is the best of three by a
+    fresh batch each, all at the same random numbers: the last iterate, the running average of the
+    last ten or so (best where noise makes the iterates wander), and the one of lowest estimate.
+
+    Args:
+        optim: an optax transformation, such as `optax.adam(0.1)`. It may ask for `value` and
+            `grad`, but not for the function itself, as line searches do.
+        sigma: the smoothing width in the units of the parameters: a number, a pytree like the
+            parameters (None in a leaf: not smoothed, differentiated by AD), or an optax schedule,
+            a function from the number of the step to a number.
+        num_samples: evaluations a step. The default is small: many rough steps beat few good ones
+            at the same number of evaluations.
+        sampler: where to sample.
+        baseline: what to subtract, as for `smooth`.
+        batch_size: evaluate at most so many samples at a time, as for `smooth`.
+        nonfinite: "propagate" or "drop" samples that are NaN or infinite, as for `smooth`.
+        rtol: relative tolerance. The run has converged when five updates in a row are below
+            `atol + rtol * norm(y)`.
+        atol: absolute tolerance. By default both are zero, and the run uses up its budget.
+        norm: the norm of updates and iterates.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, optax, optimistix as optx, smoothdiff as sd
+        >>> plateaus = lambda y, args: jnp.sum(jnp.floor(4 * jnp.abs(y - 1)))
+        >>> solver = sd.FirstOrder(optax.adam(0.05), optax.linear_schedule(0.5, 0.1, 200))
+        >>> solution = optx.minimise(
+        ...     plateaus, solver, jnp.zeros(2), options={"key": jax.random.key(0)}, throw=False
+        ... )
+        >>> [round(float(y)) for y in solution.value]
+        [1, 1]
+
+    Source: Plateau-reduced Differentiable Path Tracing (Fischer and Ritschel), which uses Adam.
+    """
+
+    optim: optax.GradientTransformation
+    sigma: PyTree
+    num_samples: int
+    sampler: AbstractSampler
+    baseline: str | AbstractBaseline
+    batch_size: int | None
+    nonfinite: Literal["propagate", "drop"]
+    rtol: float
+    atol: float
+    norm: Callable[[PyTree], Float[Array, ""]]
+
+    def __init__(
+        self,
+        optim: optax.GradientTransformation,
+        sigma: PyTree,
+        *,
+        num_samples: int = 8,
+        sampler: AbstractSampler = Gaussian(antithetic=True),  # noqa: B008 (a frozen module)
+        baseline: str | AbstractBaseline = "mean",
+        batch_size: int | None = None,
+        nonfinite: Literal["propagate", "drop"] = "propagate",
+        rtol: float = 0.0,
+        atol: float = 0.0,
+        norm: Callable[[PyTree], Float[Array, ""]] = optx.max_norm,
+    ):
+        if not isinstance(optim, optax.GradientTransformation):
+            raise TypeError(
+                f"optim must be an optax transformation such as optax.adam(0.1): {optim}"
+            )
+        self.optim = optim
+        self.sigma = sigma
+        self.num_samples = num_samples
+        self.sampler = sampler
+        self.baseline = baseline
+        self.batch_size = batch_size
+        self.nonfinite = nonfinite
+        self.rtol = rtol
+        self.atol = atol
+        self.norm = norm
+
+    def evaluations_per_step(self, y: PyTree[Array]) -> int:
+        """One batch."""
+        return self.num_samples
+
+    def final_evaluations(self, y: PyTree[Array]) -> int:
+        """A batch for each of the three candidates."""
+        return 3 * self.num_samples
+
+    def _sigma_at(self, step: Int[Array, ""]) -> PyTree:
+        with _promotion():
+            return self.sigma(step) if callable(self.sigma) else self.sigma
+
+    def _estimator(self, fn, args, step, options) -> Callable:
+        """`y -> value, (stderr, aux)`, differentiable, with the key and the sigma of a step."""
+        key, bounds = read_options(options)
+        sigma = self._sigma_at(step)
+
+        def estimate(y):
+            # one pair or frame alone has no standard error, but it does have a gradient
+            points = self.num_samples - as_baseline(self.baseline).evaluations()
+            size = take_apart(y, sigma, bounds).theta.size
+            spread = points > self.sampler.group(points, size)
+            smoothed = smooth(
+                lambda y: fn(y, args),
+                sigma,
+                num_samples=self.num_samples,
+                sampler=self.sampler,
+                baseline=self.baseline,
+                bounds=bounds,
+                batch_size=self.batch_size,
+                nonfinite=self.nonfinite,
+                has_aux=True,
+                stderr=spread,
+            )
+            out = smoothed(jax.random.fold_in(key, step), y)
+            (fun, aux), stderr = out if spread else (out, jnp.full_like(out[0], jnp.nan))
+            return fun, (stderr, aux)
+
+        return estimate
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> FirstOrderState:
+        """Checks what can be looked at; evaluates nothing."""
+        _, bounds = read_options(options)
+        step = jnp.asarray(0, jnp.int32)
+        take_apart(y, self._sigma_at(step), bounds)
+        return FirstOrderState(Progress.start(y, f_struct.dtype), self.optim.init(y), y, step)
+
+    def step(self, fn, y, args, options, state, tags):
+        """One batch, one update."""
+        progress = state.progress
+        estimate = self._estimator(fn, args, progress.step, options)
+        (fun, (stderr, aux)), grad = jax.value_and_grad(estimate, has_aux=True)(y)
+        optim = optax.with_extra_args_support(self.optim)
+        with _promotion():
+            updates, opt_state = optim.update(grad, state.opt_state, y, value=fun, grad=grad)
+            new_y = optax.apply_updates(y, updates)
+        new_y = project(new_y, read_options(options)[1])
+        share = jnp.maximum(_NEWEST, 1 / (progress.step + 1).astype(fun.dtype))
+        average = jax.tree.map(
+            lambda a, new: a + share.astype(a.dtype) * (new - a), state.average, new_y
+        )
+        with _promotion():
+            moved, size = self.norm(jax.tree.map(jnp.subtract, new_y, y)), self.norm(y)
+            quiet = jnp.where(moved < self.atol + self.rtol * size, state.quiet + 1, 0)
+        finite = all_finite((fun, grad, new_y))
+        # a failed step leaves everything as it was, so that the iterate can still be used
+        new_y, opt_state, average = jax.tree.map(
+            lambda new, old: jnp.where(finite, new, old),
+            (new_y, opt_state, average),
+            (y, state.opt_state, state.average),
+        )
+        sigma = self._sigma_at(progress.step)
+        progress = progress.after(y, fun, stderr, sigma, self.num_samples, finite)
+        # the function was never evaluated at y itself, so its aux is that of a sample near y
+        aux = jax.tree.map(lambda a: a[0], aux)
+        return new_y, FirstOrderState(progress, opt_state, average, quiet), aux
+
+    def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
+        """After small updates in a row, or a failed step."""
+        finite = state.progress.finite
+        result = optx.RESULTS.where(finite, optx.RESULTS.successful, optx.RESULTS.nonfinite)
+        return (state.quiet >= _PATIENCE) | ~finite, result
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        """Judges the last iterate, the average and the best recorded on the next step's samples."""
+        progress = state.progress
+        estimate = self._estimator(fn, args, progress.step, options)
+
+        def judged(y):
+            fun, (stderr, _) = estimate(y)
+            return fun, stderr
+
+        y, fun, stderr = judge(judged, y, state.average, progress.best_y)
+        evaluations = progress.evaluations + self.final_evaluations(y)
+        return y, aux, {"fun": fun, "stderr": stderr, "evaluations": evaluations}
