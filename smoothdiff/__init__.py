@@ -1,12 +1,17 @@
 """Gradients, Hessians and Hessian-vector products of functions that AD cannot differentiate."""
 
+from smoothdiff import kernels
+from smoothdiff._aggregate import Aggregate
 from smoothdiff._baselines import AbstractBaseline
 from smoothdiff._black_box import black_box
+from smoothdiff._call import Options
+from smoothdiff._gp import GaussianProcess
 from smoothdiff._host_calls import BlackBoxError
+from smoothdiff._least_squares import LeastSquares
+from smoothdiff._minimise import MinimiseError, Record, Result, minimise
 from smoothdiff._quadratic import HessianOperator, QuadraticModel
-from smoothdiff._samplers import AbstractSampler, Gaussian
+from smoothdiff._samplers import AbstractSampler, Gaussian, Noise, Orthogonal, Sobol, Uniform
 from smoothdiff._smooth import (
-    Options,
     smooth,
     smooth_grad,
     smooth_hessian,
@@ -15,18 +20,36 @@ from smoothdiff._smooth import (
     smooth_quadratic,
     smooth_value_and_grad,
 )
+from smoothdiff._solvers.first_order import FirstOrder
+from smoothdiff._support import local_support, matrix_support, probe_support
 
 __version__ = "0.1.0"
 
 __all__ = [
     "AbstractBaseline",
     "AbstractSampler",
+    "Aggregate",
     "BlackBoxError",
+    "FirstOrder",
     "Gaussian",
+    "GaussianProcess",
     "HessianOperator",
+    "LeastSquares",
+    "MinimiseError",
+    "Noise",
     "Options",
+    "Orthogonal",
     "QuadraticModel",
+    "Record",
+    "Result",
+    "Sobol",
+    "Uniform",
     "black_box",
+    "kernels",
+    "local_support",
+    "matrix_support",
+    "minimise",
+    "probe_support",
     "smooth",
     "smooth_grad",
     "smooth_hessian",

@@ -11,8 +11,9 @@ from jaxtyping import Array, PyTree
 
 from smoothdiff._baselines import AbstractBaseline, Control
 from smoothdiff._draws import Draws
-from smoothdiff._params import Params
+from smoothdiff._params import Layout, Params
 from smoothdiff._samplers import AbstractSampler
+from smoothdiff._support import AbstractSupport, check_support
 
 
 class Batch(eqx.Module):
@@ -20,7 +21,7 @@ class Batch(eqx.Module):
 
     `values` and `aux` have one leading row per sample. `scale` is one over the number of samples
     that count, or NaN where the estimate is void. `valid` marks the samples that count, None if
-    all do.
+    all do. `layout` says which parameter is where in a point.
     """
 
     draws: Draws
@@ -30,6 +31,8 @@ class Batch(eqx.Module):
     valid: Array | None
     scale: Array
     aux: PyTree
+    support: AbstractSupport | None
+    layout: Layout = eqx.field(static=True)
 
     def without_aux(self) -> "Batch":
         """The batch for a model that keeps it; aux can be large and says nothing of derivatives."""
@@ -46,6 +49,7 @@ def evaluate(
     baseline: AbstractBaseline,
     batch_size: int | None,
     nonfinite: Literal["propagate", "drop"],
+    support: AbstractSupport | None = None,
     free_rows: list | None = None,
 ) -> Batch:
     """Draws points around the parameters and evaluates `fun(theta, free) -> (value, aux)` there.
@@ -56,7 +60,12 @@ def evaluate(
     """
     theta, sigma = jax.lax.stop_gradient((params.theta, params.sigma))
     extra = baseline.evaluations()
-    draws = Draws(sampler, key, num_samples - extra, theta.size, theta.dtype, batch_size)
+    try:
+        draws = Draws(sampler, key, num_samples - extra, theta.size, theta.dtype, batch_size)
+    except ValueError as error:
+        if extra:
+            error.add_note(f"{extra} of num_samples={num_samples} is for the baseline, f(theta)")
+        raise
     free = params.free if free_rows is None else free_rows
 
     def row(z: Array, free: list):
@@ -70,6 +79,8 @@ def evaluate(
     values, aux, log_ratio = draws.map(rows)
     center = fun(params.clip(theta), params.free)[0] if extra else None
     _check_values(values)
+    if support is not None:
+        _check_support(support, params, baseline, values, log_ratio)
     valid = None
     if nonfinite == "drop":
         valid = jnp.stack([_finite(v) for v in jax.tree.leaves(values)]).all(axis=0)
@@ -79,12 +90,12 @@ def evaluate(
         scale = jnp.full((), 1 / draws.num, theta.dtype)
     else:
         masked = jax.tree.map(lambda r: jnp.where(_like(valid, r), r, 0), control.residual)
-        control = Control(masked, control.mean)
+        control = eqx.tree_at(lambda c: c.residual, control, masked)
         count = jnp.sum(valid).astype(theta.dtype)
         scale = jnp.where(2 * count >= draws.num, 1 / count, jnp.nan)
-    if params.inside is not None:
-        scale = jnp.where(params.inside, scale, jnp.nan)
-    return Batch(draws, values, control, log_ratio, valid, scale, aux)
+    if params.sound is not None:
+        scale = jnp.where(params.sound, scale, jnp.nan)
+    return Batch(draws, values, control, log_ratio, valid, scale, aux, support, params.layout)
 
 
 def _like(rows: Array, values: Array) -> Array:
@@ -102,3 +113,20 @@ def _check_values(values: PyTree) -> None:
                 f"the function returned dtype {leaf.dtype}; a smoothed function must return "
                 "real floating-point values: use .astype(float)"
             )
+
+
+def _check_support(
+    support: AbstractSupport,
+    params: Params,
+    baseline: AbstractBaseline,
+    values: PyTree,
+    log_ratio: Array | None,
+) -> None:
+    if params.free:
+        raise ValueError("support needs a sigma for every leaf of the parameters")
+    if log_ratio is not None:
+        raise ValueError("support needs points that are normal themselves: Gaussian, Sobol, ...")
+    if not baseline.termwise:
+        raise ValueError('support goes with baseline="mean", "center" or "none"')
+    row = jax.tree.map(lambda v: jax.ShapeDtypeStruct(v.shape[1:], v.dtype), values)
+    check_support(support, params.layout.tree(params.theta), row)

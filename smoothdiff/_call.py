@@ -10,11 +10,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from smoothdiff._baselines import AbstractBaseline, as_baseline
+from smoothdiff._baselines import AbstractBaseline
 from smoothdiff._batch import Batch, evaluate
-from smoothdiff._estimate import combine, displacement
+from smoothdiff._estimate import combine, displacement, objective
+from smoothdiff._named_baselines import as_baseline
 from smoothdiff._params import Params, as_argnums, as_key, choose, replace, take_apart
-from smoothdiff._samplers import AbstractSampler, Gaussian
+from smoothdiff._samplers import Gaussian, as_sampler
+from smoothdiff._support import as_support
 
 
 class Options(TypedDict, total=False):
@@ -23,9 +25,13 @@ class Options(TypedDict, total=False):
     Args:
         argnums: which of the function's arguments to smooth and differentiate, an int or a tuple.
         num_samples: evaluations of the function in one call, all included.
-        sampler: where to sample, a sampler object such as `Gaussian(antithetic=True)`.
+        sampler: where to sample, a sampler object such as `Gaussian(antithetic=True)`; or a noise
+            object that smooths instead of the Gaussian, see `Noise`.
         baseline: what to subtract: "none", "mean" (of the other samples), "center" (f(theta), one
-            evaluation) or a baseline object.
+            evaluation), "linear", "quadratic" or "gp" (fitted), or a baseline object.
+        support: for a function that returns an array of terms whose sum is the objective: a linear
+            map from parameter-shaped to term-shaped arrays with entries 0 and 1 that says which
+            terms a parameter may influence. See `local_support`.
         bounds: a pair (low, high), each a number or a pytree like the parameters. The function
             sees points clamped to them; the weights see the points as drawn.
         batch_size: evaluate and differentiate at most so many samples at a time, which bounds the
@@ -38,8 +44,9 @@ class Options(TypedDict, total=False):
 
     argnums: int | Sequence[int]
     num_samples: int
-    sampler: AbstractSampler
+    sampler: Any
     baseline: str | AbstractBaseline
+    support: Callable[[PyTree], Array] | None
     bounds: tuple[PyTree, PyTree] | None
     batch_size: int | None
     nonfinite: Literal["propagate", "drop"]
@@ -55,8 +62,9 @@ class Call:
     sigma: Any
     argnums: int | Sequence[int] = 0
     num_samples: int = 64
-    sampler: AbstractSampler = Gaussian()  # noqa: RUF009 (a frozen module)
+    sampler: Any = Gaussian()  # noqa: RUF009 (a frozen module)
     baseline: str | AbstractBaseline = "mean"
+    support: Callable[[PyTree], Array] | None = None
     bounds: tuple[PyTree, PyTree] | None = None
     batch_size: int | None = None
     nonfinite: Literal["propagate", "drop"] = "propagate"
@@ -66,8 +74,7 @@ class Call:
     def __post_init__(self):
         if not callable(self.fun):
             raise TypeError(f"the first argument must be a function, not {type(self.fun).__name__}")
-        if not isinstance(self.sampler, AbstractSampler):
-            raise TypeError(f"sampler must be a sampler object such as Gaussian(): {self.sampler}")
+        as_sampler(self.sampler)
         if self.nonfinite not in ("propagate", "drop"):
             raise ValueError(f'nonfinite must be "propagate" or "drop", not {self.nonfinite!r}')
         for name in ("num_samples", "batch_size"):
@@ -85,7 +92,8 @@ class Call:
         """The options as a transform takes them."""
         return {f.name: getattr(self, f.name) for f in fields(self)[2:]}  # pyright: ignore
 
-    def params(self, args: tuple) -> Params:
+    def params(self, key: Any, args: tuple) -> Params:
+        as_key(key)  # first, or else what was passed in place of a key is taken for a parameter
         return take_apart(choose(args, self.argnums), self.sigma, self.bounds)
 
     def batch(
@@ -95,9 +103,15 @@ class Call:
 
         def fun(theta: Array, free: list) -> tuple[PyTree, PyTree]:
             out = self.fun(*replace(args, self.argnums, params.layout.tree(theta, free)))
+            if self.has_aux and not (isinstance(out, tuple | list) and len(out) == 2):
+                raise TypeError("with has_aux=True the function must return a pair (value, aux)")
             value, aux = out if self.has_aux else (out, None)
             value = jax.tree.map(jnp.asarray, value)
-            if scalar and not (isinstance(value, jax.Array) and value.shape == ()):
+            if (
+                scalar
+                and self.support is None
+                and not (isinstance(value, jax.Array) and value.shape == ())
+            ):
                 shape = jax.tree.map(jnp.shape, value)
                 raise TypeError(
                     f"the function must return a scalar here, not an output of shape {shape}: use "
@@ -110,18 +124,20 @@ class Call:
             params,
             as_key(key),
             num_samples=self.num_samples,
-            sampler=self.sampler,
+            sampler=as_sampler(self.sampler),
             baseline=as_baseline(self.baseline),
             batch_size=self.batch_size,
             nonfinite=self.nonfinite,
+            support=as_support(self.support),
             free_rows=free_rows,
         )
 
     def smoothed(self, key: Any, *args: Any, scalar: bool = False) -> tuple[PyTree, PyTree]:
         """(value, aux) of the smoothed function; differentiating it is the whole library."""
-        params = self.params(args)
+        params = self.params(key, args)
         batch = self.batch(key, args, params, scalar=scalar)
-        return combine(batch, *displacement(params)), batch.aux
+        estimate = objective if scalar else combine
+        return estimate(batch, *displacement(params)), batch.aux
 
     def shifted_argnums(self, num_args: int) -> int | tuple[int, ...]:
         """Where the parameters stand among the arguments of the smoothed function, key first."""

@@ -30,7 +30,7 @@ class Draws(eqx.Module):
         self, sampler: AbstractSampler, key: Array, num: int, n: int, dtype, batch_size: int | None
     ):
         sampler.check(num, n)
-        block = sampler.block(n)
+        block = sampler.block(num, n)
         self.sampler = sampler
         self.key_data = jax.random.key_data(key)
         self.impl = str(jax.random.key_impl(key))

@@ -91,7 +91,7 @@ class Params:
     """The arguments of one call, taken apart.
 
     `theta`, `sigma`, `low` and `high` have one entry for each smoothed number. `free` holds the
-    leaves whose sigma is None. `inside` is False where traced bounds or parameters are invalid.
+    leaves whose sigma is None. `sound` is False if traced arguments turn out invalid.
     """
 
     layout: Layout
@@ -100,7 +100,7 @@ class Params:
     sigma_traced: bool
     low: Array | None
     high: Array | None
-    inside: Array | None
+    sound: Array | None
     free: list[Array]
 
     def clip(self, x: Array) -> Array:
@@ -146,9 +146,12 @@ def take_apart(target: PyTree, sigma: PyTree, bounds: tuple[PyTree, PyTree] | No
     )
     theta, width = layout.vector(leaves), layout.vector(sigmas)
     sigma_traced = not all(map(is_concrete, sigmas))
-    if sigma_traced:
-        width = jnp.where(width > 0, width, jnp.nan)
-    low = high = inside = None
+    checks = [
+        _sigma_fits(s, leaf)
+        for s, leaf in zip(sigmas, leaves, strict=True)
+        if s is not None and not (is_concrete(s) and is_concrete(leaf))
+    ]
+    low = high = None
     if bounds is not None:
         if not (isinstance(bounds, tuple | list) and len(bounds) == 2):
             raise ValueError("bounds must be a pair (low, high) of numbers or pytrees")
@@ -159,9 +162,10 @@ def take_apart(target: PyTree, sigma: PyTree, bounds: tuple[PyTree, PyTree] | No
                 _check_bounds(lo, hi, leaf, name)
         low, high = layout.vector(lows), layout.vector(highs)
         if not all(map(is_concrete, (low, high, theta))):
-            inside = jnp.all((low <= theta) & (theta <= high))
+            checks.append(jnp.all((low <= theta) & (theta <= high)))
+    sound = jnp.all(jnp.stack(checks)) if checks else None
     free = [leaf for leaf, keep in zip(leaves, smoothed, strict=True) if not keep]
-    return Params(layout, theta, width, sigma_traced, low, high, inside, free)
+    return Params(layout, theta, width, sigma_traced, low, high, sound, free)
 
 
 def _match(value: PyTree, target: PyTree, what: str) -> list:
@@ -220,6 +224,13 @@ def _check_sigma(sigma: Any, leaf: Array, name: str) -> None:
                 "samples round to the parameter itself: use a larger sigma, float64, or "
                 "parameters in other units"
             )
+
+
+def _sigma_fits(sigma: Any, leaf: Array) -> Array:
+    """What `_check_sigma` asks for, of values that are traced."""
+    width = jnp.broadcast_to(jnp.asarray(sigma).astype(leaf.dtype), leaf.shape)
+    spacing = jnp.spacing(jnp.abs(jax.lax.stop_gradient(leaf)))
+    return jnp.all((width > 0) & (width < jnp.inf) & ~(width < spacing))
 
 
 def _sides(side: PyTree, default: float, target: PyTree) -> list:

@@ -9,7 +9,7 @@ import lineax as lx
 from jaxtyping import Array, Float, PyTree
 
 from smoothdiff._batch import Batch
-from smoothdiff._estimate import combine
+from smoothdiff._estimate import objective
 from smoothdiff._params import Layout
 from smoothdiff._stderr import grad_stderr, hvp_stderr, value_stderr
 
@@ -34,7 +34,7 @@ class HessianOperator(lx.AbstractLinearOperator):
 
     def _product(self, direction: Float[Array, " n"]) -> Float[Array, " n"]:
         # in units of sigma
-        gradient = jax.grad(lambda shift: combine(self.batch, shift))
+        gradient = jax.grad(lambda shift: objective(self.batch, shift))
         return jax.jvp(gradient, (jnp.zeros_like(direction),), (direction,))[1]
 
     def stderr(self, vector: PyTree) -> PyTree:

@@ -14,53 +14,52 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from smoothdiff._batch import Batch
-from smoothdiff._estimate import weights
+from smoothdiff._estimate import weigh, weights
 
 
 def value_stderr(batch: Batch, estimate: PyTree) -> PyTree:
-    """The standard error of the smoothed value, leaf by leaf."""
+    """The standard error of the smoothed value, leaf by leaf; of the sum of terms for a scalar."""
 
     def leaf(values: Array, residual: Array, mean: Array) -> Array:
         def sums(z, log_ratio, rows, shift):
             # at zero displacement: w (f - b) + b, which is f itself for plain Gaussian points
             value, rest = rows
-            w = weights(z, log_ratio, shift)[:, None].astype(value.dtype)
-            return w * rest + (value - rest)
+            out = weigh(weights(batch, z, log_ratio, shift), rest) + (value - rest)
+            flat = out.reshape(len(out), -1)
+            return flat if mean.ndim else jnp.sum(flat, axis=1, keepdims=True)
 
-        rows = (values.reshape(len(values), -1), residual.reshape(len(values), -1))
-        flat = _spread(batch, sums, rows, mean.reshape(-1), jnp.max(jnp.abs(residual)))
-        return flat.reshape(mean.shape)
+        scale = jnp.max(jnp.abs(residual))
+        return _spread(batch, sums, (values, residual), mean.reshape(-1), scale).reshape(mean.shape)
 
-    return jax.tree.map(leaf, batch.values, batch.control.residual, estimate)
+    return jax.tree.map(leaf, batch.values, batch.control.errors(), estimate)
 
 
 def jacobian_stderr(batch: Batch, estimate: PyTree) -> PyTree:
     """The standard error of the derivative in units of sigma; leaves (..., n) like `estimate`."""
 
     def leaf(residual: Array, mean: Array) -> Array:
-        rows = residual.reshape(len(residual), -1)
         columns = mean.reshape(-1, mean.shape[-1]).T
         scale = jnp.max(jnp.abs(residual))
 
         def column(direction: Array, column_mean: Array) -> Array:
             def sums(z, log_ratio, rows, shift):
                 tangent = jnp.broadcast_to(direction, shift.shape)
-                moved = lambda s: weights(z, log_ratio, s)[:, None].astype(rows.dtype) * rows
-                return jax.jvp(moved, (shift,), (tangent,))[1]
+                moved = lambda s: weigh(weights(batch, z, log_ratio, s), rows)
+                return jax.jvp(moved, (shift,), (tangent,))[1].reshape(len(rows), -1)
 
-            return _spread(batch, sums, rows, column_mean, scale)
+            return _spread(batch, sums, residual, column_mean, scale)
 
         n = mean.shape[-1]
         out = jax.lax.map(lambda a: column(*a), (jnp.eye(n, dtype=batch.draws.dtype), columns))
         return out.T.reshape(mean.shape)
 
-    return jax.tree.map(leaf, batch.control.residual, estimate)
+    return jax.tree.map(leaf, batch.control.errors(), estimate)
 
 
 def grad_stderr(batch: Batch, estimate: Float[Array, " n"]) -> Float[Array, " n"]:
     """The standard error of the gradient in units of sigma, for a scalar function."""
-    residual = batch.control.residual
-    sums = lambda z, log_ratio, rows, shift: _row_grad(z, log_ratio, rows)(shift)
+    residual = batch.control.errors()
+    sums = lambda z, log_ratio, rows, shift: _row_grad(batch, z, log_ratio, rows)(shift)
     return _spread(batch, sums, residual, estimate, jnp.max(jnp.abs(residual)))
 
 
@@ -68,11 +67,11 @@ def hvp_stderr(
     batch: Batch, direction: Float[Array, " n"], estimate: Float[Array, " n"]
 ) -> Float[Array, " n"]:
     """The standard error of the Hessian-vector product in units of sigma, for a scalar function."""
-    residual = batch.control.residual
+    residual = batch.control.errors()
 
     def sums(z, log_ratio, rows, shift):
         tangent = jnp.broadcast_to(direction, shift.shape)
-        return jax.jvp(_row_grad(z, log_ratio, rows), (shift,), (tangent,))[1]
+        return jax.jvp(_row_grad(batch, z, log_ratio, rows), (shift,), (tangent,))[1]
 
     return _spread(batch, sums, residual, estimate, jnp.max(jnp.abs(residual)))
 
@@ -87,10 +86,12 @@ def free_grad_stderr(batch: Batch, per_row: Array) -> tuple[Array, Array]:
     return mean.reshape(per_row.shape[1:]), error.reshape(per_row.shape[1:])
 
 
-def _row_grad(z: Array, log_ratio: Array | None, rows: Array) -> Callable[[Array], Array]:
+def _row_grad(
+    batch: Batch, z: Array, log_ratio: Array | None, rows: Array
+) -> Callable[[Array], Array]:
     # each row has a displacement of its own, so one reverse pass gives the gradient of every row
     def total(shift: Array) -> Array:
-        return jnp.sum(weights(z, log_ratio, shift).astype(rows.dtype) * rows)
+        return jnp.sum(weigh(weights(batch, z, log_ratio, shift), rows))
 
     return jax.grad(total)
 
@@ -100,6 +101,9 @@ def _spread(batch: Batch, sums: Callable, rows: PyTree, mean: Array, scale: Arra
     draws = batch.draws
     group = draws.sampler.group(draws.num, draws.n)
     count = -(-draws.num // group)
+    if count < 2 and draws.sampler.balanced:
+        # one scrambled set: as if its points were independent, which is too wide but never narrow
+        group, count = draws.sampler.block(draws.num, draws.n), draws.num
     if count < 2:
         raise ValueError(
             f"a standard error needs at least two independent groups of samples, and {draws.num} "

@@ -1,0 +1,144 @@
+r"""The baseline "gp": Gaussian-process regression through the samples, smoothed in closed form.
+
+The samples are not only weighted but also interpolated. With points z in units of sigma and
+
+$$ k(z, z') = c + \frac{z \cdot z'}{n} + \exp\Big(-\frac{|z - z'|^2}{2 \ell^2 n}\Big), $$
+
+the fit $m(z) = \sum_j \alpha_j k(z, z_j)$, $\alpha = (K + \lambda I)^{-1} f$, has a smoothed value
+whose derivatives are known, and what it leaves, $f - m$, is small and goes through the weights.
+"""
+
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from smoothdiff._baselines import AbstractBaseline, Control
+from smoothdiff._draws import Draws
+from smoothdiff._leave_out import group_share, leave_out, left_out_group
+
+# The weight of the constant in the kernel: the level of f is nearly free, and what is left of it
+# after the plain mean is subtracted is not worth float32's digits.
+_CONSTANT = 10.0
+
+
+class GPControl(Control):
+    """A fit at work. `alpha` has a row for each sample, shaped like the values."""
+
+    residual: PyTree
+    left_out: PyTree
+    alpha: PyTree
+    level: PyTree
+    draws: Draws
+    length: float | None = eqx.field(static=True)
+
+    def errors(self) -> PyTree:
+        return self.left_out
+
+    def smoothed(self, shift: Array, ratio: Array | None) -> PyTree:
+        """The closed form of the fit's smoothed value at displaced parameters."""
+        # the Gaussian that smooths has its centre at m and width s, in units of the drawn points
+        s = jnp.ones_like(shift) if ratio is None else 1 / ratio
+        m = s * shift
+
+        def chunk(start, z, log_ratio, alpha):
+            row = _CONSTANT + jnp.matmul(z, m, precision="highest") / shift.size
+            if self.length is not None:
+                square = self.length**2 * shift.size
+                narrow = 1 / (square + s**2)
+                away = jnp.matmul(z * z, narrow, precision="highest") + jnp.sum(m * m * narrow)
+                away -= 2 * jnp.matmul(z, m * narrow, precision="highest")
+                row += jnp.exp((jnp.sum(jnp.log(square * narrow)) - away) / 2)
+            return jax.tree.map(
+                lambda a: jnp.tensordot(row.astype(a.dtype), a, axes=1, precision="highest"), alpha
+            )
+
+        total = self.draws.sum(chunk, self.alpha)
+        return jax.tree.map(jnp.add, total, self.level)
+
+
+class GaussianProcess(AbstractBaseline):
+    r"""Subtracts a Gaussian-process regression of the function on the samples: baseline="gp".
+
+    For independent samples the fit that is subtracted from a sample leaves that sample out, in
+    closed form, so the estimate is unbiased but for terms of order $\lambda / (c N)$ times the
+    level of f. A single scrambled point set is fitted as a whole, which is far more accurate there
+    and biased: it shrinks derivatives, by 1 % at N = 64 for a step in three dimensions and by 8 %
+    for a cubic. It costs about $N^3$ operations and an N x N matrix, so use it up to a few
+    thousand samples, where an evaluation is what costs.
+
+    Args:
+        length: the length scale of the kernel in units of sigma and of the square root of n; None
+            leaves a constant and a linear function, which is ridge regression.
+        ridge: the variance of what the fit cannot explain, over that of what it can.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, smoothdiff as sd
+        >>> f = lambda x: jnp.floor(jnp.sum(x**2))
+        >>> g = sd.smooth_grad(f, 0.5, baseline=sd.GaussianProcess(), num_samples=64)
+        >>> g(jax.random.key(0), jnp.ones(3)).shape
+        (3,)
+
+    Source: own; the idea is Bayesian quadrature (O'Hagan, 1991) and control functionals (Oates,
+    Girolami and Chopin, 2017), with a Gaussian measure and its derivatives.
+    """
+
+    length: float | None = eqx.field(static=True, default=1.0)
+    ridge: float = eqx.field(static=True, default=0.1)
+
+    termwise: ClassVar[bool] = False
+
+    def __check_init__(self):
+        if not ((self.length is None or self.length > 0) and self.ridge > 0):
+            raise ValueError(f"length and ridge must be positive: {self.length}, {self.ridge}")
+
+    def __call__(self, values, draws, log_ratio, valid, center):
+        self.check_gaussian(draws)
+        counts = jnp.ones(draws.num, draws.dtype) if valid is None else valid.astype(draws.dtype)
+        gram = self._gram(draws) * (counts[:, None] * counts[None, :])
+        unit = jnp.eye(draws.num, dtype=draws.dtype)
+        factor = jax.scipy.linalg.cho_factor(gram + self.ridge * unit)
+        inverse = jax.scipy.linalg.cho_solve(factor, unit)
+        blocks = lambda index: inverse[index[:, :, None], index[:, None, :]]
+        group = left_out_group(draws)
+
+        def fit(v: Array) -> tuple[Array, ...]:
+            flat = v.reshape(draws.num, -1)
+            level = jnp.matmul(
+                (counts / jnp.sum(counts)).astype(v.dtype), flat, precision="highest"
+            )
+            small = (flat - level[None]).astype(draws.dtype) * counts[:, None]
+            alpha = jax.scipy.linalg.cho_solve(factor, small)
+            left_out = leave_out(alpha, blocks, group or 1)
+            residual = self.ridge * alpha
+            if group is not None:
+                # every group's fit counts by its share of the samples
+                residual = left_out
+                weighted = left_out * group_share(counts, group)[:, None]
+                alpha = alpha - jax.scipy.linalg.cho_solve(factor, weighted)
+            rows = (a.astype(v.dtype).reshape(v.shape) for a in (residual, left_out, alpha))
+            return *rows, level.reshape(v.shape[1:])
+
+        leaves, treedef = jax.tree.flatten(values)
+        residual, left_out, alpha, level = (
+            treedef.unflatten(part) for part in zip(*map(fit, leaves), strict=True)
+        )
+        return GPControl(residual, left_out, alpha, level, draws, self.length)
+
+    def _gram(self, draws: Draws) -> Float[Array, "N N"]:
+        """The kernel between all pairs of samples, chunk by chunk."""
+
+        def rows(z: Array, _: Any) -> Array:
+            def columns(y: Array, _: Any) -> Array:
+                dot = jnp.matmul(y, z.T, precision="highest")
+                out = _CONSTANT + dot / draws.n
+                if self.length is not None:
+                    apart = jnp.sum(y * y, axis=1)[:, None] + jnp.sum(z * z, axis=1)[None] - 2 * dot
+                    out += jnp.exp(-jnp.maximum(apart, 0) / (2 * self.length**2 * draws.n))
+                return out
+
+            return draws.map(columns).T
+
+        return draws.map(rows)

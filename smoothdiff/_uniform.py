@@ -1,0 +1,89 @@
+"""Uniform random numbers by row: independent, or Sobol's sequence with Owen's scrambling."""
+
+from functools import lru_cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int, Key, UInt32
+
+# scipy has direction numbers (Joe and Kuo) for so many dimensions
+MAX_DIMENSION = 21_201
+
+
+def uniform_bits(
+    key: Key[Array, ""], rows: Int[Array, " m"], dims: int, size: int | None
+) -> UInt32[Array, "m dims"]:
+    """Uniform 32-bit numbers, each row from the key and its index alone.
+
+    With a `size` they are quasi-random: rows come in sets of that many, each a Sobol sequence
+    scrambled on its own. Dimensions beyond `MAX_DIMENSION` stay independent.
+    """
+    even = 0 if size is None else min(dims, MAX_DIMENSION)
+    parts = []
+    if size is not None:
+        seeds = jax.vmap(
+            lambda set_: jax.random.bits(jax.random.fold_in(key, set_), (even,), jnp.uint32)
+        )
+        index = (rows % size).astype(jnp.uint32)
+        parts.append(_scramble(_sobol(index, even, size), seeds(rows // size)))
+    if dims > even:
+        # another branch of the key than the seeds'
+        own = key if size is None else jax.random.fold_in(key, np.uint32(2**32 - 1))
+        parts.append(_independent(own, rows, dims - even))
+    return parts[0] if len(parts) == 1 else jnp.concatenate(parts, axis=1)
+
+
+def _independent(key: Array, rows: Array, dims: int) -> Array:
+    bits = lambda row: jax.random.bits(jax.random.fold_in(key, row), (dims,), jnp.uint32)
+    return jax.vmap(bits)(rows)
+
+
+def midpoints(bits: UInt32[Array, "..."], dtype) -> Array:
+    """Uniform numbers at the midpoints of cells, so that no inverse CDF of them is infinite."""
+    width = 23 if jnp.finfo(dtype).bits == 32 else 32
+    cell = (bits >> np.uint32(32 - width)).astype(dtype)
+    return (cell + 0.5) * 2.0**-width
+
+
+@lru_cache(maxsize=32)
+def _directions(n: int, bits: int) -> np.ndarray:
+    """The first `bits` direction numbers of each of n dimensions, shape (bits, n)."""
+    # scipy.stats is slow to import, and only those who draw Sobol points need it
+    from scipy.stats import qmc
+
+    sequence = qmc.Sobol(n, scramble=False, bits=32)
+    rows = []
+    for k in range(bits):
+        # scipy orders the points by Gray code: point 2^(k+1) - 1 is direction number k
+        sequence.reset().fast_forward(2 ** (k + 1) - 1)
+        rows.append(np.round(sequence.random(1)[0] * 2.0**32).astype(np.uint32))
+    return np.stack(rows)
+
+
+def _sobol(index: UInt32[Array, " m"], n: int, size: int) -> UInt32[Array, "m n"]:
+    """Points `index` of the Sobol sequence as 32-bit fractions."""
+    bits = max(1, (size - 1).bit_length())
+    point = jnp.zeros((index.size, n), jnp.uint32)
+    for k, direction in enumerate(_directions(n, bits)):
+        bit = (index >> np.uint32(k)) & np.uint32(1)
+        point ^= bit[:, None] * direction[None]
+    return point
+
+
+def _scramble(x: UInt32[Array, "m n"], seed: UInt32[Array, "m n"]) -> UInt32[Array, "m n"]:
+    """Owen's nested uniform scrambling: a hash in which each bit depends on higher bits only.
+
+    Source: B. Burley, Practical hash-based Owen scrambling (JCGT 2020).
+    """
+    x = _reverse_bits(x) + seed
+    for factor in (0x6C50B47C, 0xB82F1E52, 0xC7AFE638, 0x8D22F6E6):
+        x ^= x * np.uint32(factor)
+    return _reverse_bits(x)
+
+
+def _reverse_bits(x: UInt32[Array, "..."]) -> UInt32[Array, "..."]:
+    for shift, mask in ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF)):
+        mask = np.uint32(mask)
+        x = ((x >> np.uint32(shift)) & mask) | ((x & mask) << np.uint32(shift))
+    return (x >> np.uint32(16)) | (x << np.uint32(16))
