@@ -7,6 +7,7 @@ from smoothdiff._black_box import black_box
 from smoothdiff._call import Options
 from smoothdiff._gp import GaussianProcess
 from smoothdiff._host_calls import BlackBoxError
+from smoothdiff._importance import Importance, difference_hvp
 from smoothdiff._least_squares import LeastSquares
 from smoothdiff._minimise import MinimiseError, Record, Result, minimise
 from smoothdiff._quadratic import HessianOperator, QuadraticModel
@@ -34,6 +35,7 @@ __all__ = [
     "Gaussian",
     "GaussianProcess",
     "HessianOperator",
+    "Importance",
     "LeastSquares",
     "MinimiseError",
     "Noise",
@@ -45,6 +47,7 @@ __all__ = [
     "Sobol",
     "Uniform",
     "black_box",
+    "difference_hvp",
     "kernels",
     "local_support",
     "matrix_support",

@@ -74,7 +74,6 @@ class Call:
     def __post_init__(self):
         if not callable(self.fun):
             raise TypeError(f"the first argument must be a function, not {type(self.fun).__name__}")
-        as_sampler(self.sampler)
         if self.nonfinite not in ("propagate", "drop"):
             raise ValueError(f'nonfinite must be "propagate" or "drop", not {self.nonfinite!r}')
         for name in ("num_samples", "batch_size"):

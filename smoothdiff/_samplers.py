@@ -312,5 +312,6 @@ def as_sampler(sampler: Any) -> AbstractSampler:
         return Noise(sampler)
     raise TypeError(
         "sampler must be a sampler object such as Gaussian() or Sobol(), or a noise object with "
-        f"sample and log_prob, not {sampler!r}"
+        f"sample and log_prob, not {sampler!r} (Importance is for smooth_grad and smooth_hessian "
+        "only; Aggregate is for all transforms)"
     )

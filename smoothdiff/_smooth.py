@@ -11,6 +11,7 @@ from jaxtyping import Array, PyTree
 from smoothdiff._batch import Batch
 from smoothdiff._call import Call, transform
 from smoothdiff._estimate import combine, displacement, objective
+from smoothdiff._importance import Importance, elementwise
 from smoothdiff._named_baselines import as_baseline
 from smoothdiff._params import Params, choose, replace
 from smoothdiff._quadratic import HessianOperator, QuadraticModel
@@ -141,6 +142,8 @@ def smooth_grad(call: Call) -> Callable:
 
     Source: Stochastic Gradient Estimation for Higher-order Differentiable Rendering, eq. 17.
     """
+    if isinstance(call.sampler, Importance):
+        return elementwise(call, call.sampler, order=1)
     both = smooth_value_and_grad(call.fun, call.sigma, **call.options())
 
     def g(key: Any, *args: Any) -> PyTree:
@@ -267,6 +270,9 @@ def smooth_hessian(call: Call) -> Callable:
 
     Source: Stochastic Gradient Estimation for Higher-order Differentiable Rendering, eq. 20.
     """
+
+    if isinstance(call.sampler, Importance):
+        return elementwise(call, call.sampler, order=2)
 
     def g(key: Any, *args: Any) -> PyTree:
         params = call.params(key, args)
