@@ -1,0 +1,1 @@
+"""Error against evaluations and against run time, for every method on the same tasks."""

@@ -1,0 +1,80 @@
+"""The command line: `python -m benchmarks list | run TASK... | overhead`."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks import methods, tasks
+
+RESULTS = Path(__file__).parent / "results"
+
+
+def main(arguments: list[str] | None = None, results: Path = RESULTS) -> None:
+    """Runs what the command line says; results go to benchmarks/results."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    commands.add_parser("list", help="name the tasks and the methods")
+    run = commands.add_parser("run", help="run methods on tasks; what has been run is kept")
+    run.add_argument("tasks", nargs="+", metavar="TASK", choices=tasks.TASKS)
+    run.add_argument("--full", action="store_true", help="every start, at full size")
+    run.add_argument("--seeds", type=int, metavar="N", help="number of starts")
+    run.add_argument("--methods", metavar="A,B", help="only these, separated by commas")
+    run.add_argument("--fresh", action="store_true", help="run again what has been run")
+    commands.add_parser("overhead", help="derivatives against evaluating at the same points")
+    options = parser.parse_args(arguments)
+
+    if options.command == "list":
+        _list()
+    elif options.command == "run":
+        command = " ".join(["python -m benchmarks", *arguments])
+        for task in options.tasks:
+            _run(task, options, results / task, command)
+    else:
+        from benchmarks import overhead
+
+        overhead.main(results / "overhead")
+
+
+def _list() -> None:
+    for title, names, load in (
+        ("Tasks", tasks.TASKS, tasks.module),
+        ("Methods", methods.METHODS, methods.load),
+    ):
+        shown = Table(title=title, show_header=False, title_justify="left")
+        for name in names:
+            found = load(name)
+            shown.add_row(name, getattr(found, "TITLE", None) or found.title)
+        Console().print(shown)
+
+
+def _run(name: str, options: argparse.Namespace, folder: Path, command: str) -> None:
+    from benchmarks import _report, _summary
+    from benchmarks._harness import run
+
+    task = tasks.module(name).build(options.full)
+    setting = "full" if options.full else "quick"
+    chosen = options.methods.split(",") if options.methods else methods.METHODS
+    found = run(
+        task,
+        [methods.load(method) for method in chosen],
+        options.seeds or task.seeds,
+        folder / "runs",
+        setting=setting,
+        fresh=options.fresh,
+    )
+    results = _summary.summarise(task, found, setting, command)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "results.json").write_text(json.dumps(results, indent=1) + "\n")
+    _report.write(task, results, folder)
+    console = Console()
+    console.print(_report.tables(results))
+    console.print(f"Written to {folder}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,160 @@
+"""Results as pictures and as a table on the terminal."""
+
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from rich import box
+from rich.console import Group
+from rich.table import Table
+
+from benchmarks._style import figure, looks
+from benchmarks._summary import COSTS, ERRORS, LEVELS, band
+from benchmarks._task import Task
+
+FLOOR = 1e-7  # the smallest relative error that is drawn
+PICTURED = 3  # starts in images.png
+LABELS = {
+    "image_error": "Image error, relative to the start",
+    "parameter_error": "Parameter error, relative to the start",
+    "evaluations": "Evaluations",
+    "seconds": "Seconds",
+}
+CAPTIONS = {
+    "image_error": "On renders without noise, which are not charged.",
+    "parameter_error": "Seconds are without compilation.",
+}
+
+
+def write(task: Task, results: dict[str, Any], folder: Path) -> None:
+    """Draws what there is to draw."""
+    if not able(results):
+        return
+    _curves(results, "seconds", folder / "error-vs-time.png")
+    _curves(results, "evaluations", folder / "error-vs-evaluations.png")
+    if task.image is not None:
+        _images(task, results, folder / "images.png")
+
+
+def able(results: dict[str, Any]) -> dict[str, Any]:
+    """The methods that ran."""
+    return {name: found for name, found in results["methods"].items() if "runs" in found}
+
+
+def _curves(results: dict[str, Any], cost: str, path: Path) -> None:
+    """Median and quartiles over the starts: image error left, parameter error right."""
+    methods, look = able(results), looks(results["methods"])
+    with figure(path, 1, 2, (9, 3.8)) as (drawn, axes):
+        for axis, error in zip(axes[0], ERRORS, strict=True):
+            lowest, highest = LEVELS["90"], 1.0
+            for name, found in methods.items():
+                runs = found["runs"]
+                costs = np.concatenate([run[cost] for run in runs])
+                grid = np.geomspace(min(run[cost][1] for run in runs), costs.max(), 200)
+                low, middle, high = np.maximum(band(runs, error, cost, grid), FLOOR)
+                axis.plot(grid, middle, label=found["title"], **look[name])
+                axis.fill_between(grid, low, high, color=look[name]["color"], alpha=0.15, lw=0)
+                lowest, highest = min(lowest, low.min()), max(highest, high.max())
+            axis.set(ylim=(lowest / 1.3, highest * 1.3))
+            axis.set(xscale="log", yscale="log", xlabel=LABELS[cost], title=LABELS[error])
+            for level in (level for level in LEVELS.values() if level >= lowest):
+                axis.axhline(level, color="0.6", lw=0.6, ls=":", zorder=0)
+        starts = max(found["starts"] for found in methods.values())
+        handles, labels = axes[0, 0].get_legend_handles_labels()
+        drawn.legend(handles, labels, loc="outside lower center", ncols=min(4, len(labels)))
+        drawn.suptitle(
+            f"{results['title']} ({results['setting']}): median and quartiles over {starts} starts",
+            x=0.01,
+            ha="left",
+            fontsize=10,
+        )
+
+
+def _images(task: Task, results: dict[str, Any], path: Path) -> None:
+    """Start, found by each method, and reference, for the first starts: none is picked by hand."""
+    assert task.image is not None
+    methods = able(results)
+    rows = min(PICTURED, *(found["starts"] for found in methods.values()))
+    _, unravel = ravel_pytree(task.reference)
+    columns = len(methods) + 2
+    with figure(path, rows, columns, (1.7 * columns, 1.9 * rows + 0.2)) as (_, axes):
+        for seed, line in enumerate(axes):
+            runs = [found["runs"][seed] for found in methods.values()]
+            found = [unravel(jnp.asarray(run["found"])) for run in runs]
+            shown = [task.start(seed), *found, task.reference]
+            notes = [f"{run['image_error'][-1]:.2g}" for run in runs]
+            names = ["Start", *(found["title"] for found in methods.values()), "Reference"]
+            for axis, y, name, note in zip(line, shown, names, ["1", *notes, "0"], strict=True):
+                axis.imshow(_display(task.image(y)), interpolation="nearest")
+                axis.set(xticks=[], yticks=[], xlabel=f"error {note}")
+                axis.spines[:].set_visible(False)
+                if seed == 0:
+                    axis.set_title(name.replace(", ", ",\n"), fontsize=8, loc="center")
+            line[0].set_ylabel(f"start {seed}")
+
+
+def _display(image) -> np.ndarray:
+    """Linear RGB as a screen shows it."""
+    linear = np.clip(np.asarray(image), 0, 1)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def tables(results: dict[str, Any]) -> Group:
+    """What each level took and what was left at the end, for the terminal."""
+    methods = results["methods"]
+    not_able = [
+        f"{found['title']} is not able here: {found['not_able']}."
+        for name, found in methods.items()
+        if name not in able(results)
+    ]
+    took = [_took(results, error) for error in ERRORS]
+    return Group(*took, _left(results), *not_able)
+
+
+def _took(results: dict[str, Any], error: str) -> Table:
+    kind = error.replace("_", " ")
+    shown = Table(
+        title=f"{results['title']} ({results['setting']}): reducing the {kind}",
+        caption=f"Median \\[quartiles] over the starts; - is not reached. {CAPTIONS[error]}",
+        box=box.SIMPLE_HEAD,
+    )
+    shown.add_column("method")
+    for column in ("reduction", "solved", *COSTS):
+        shown.add_column(column, justify="right", no_wrap=True)
+    for found in able(results).values():
+        for level, reached in found[error]["levels"].items():
+            first, last = level == "90", level == "99.9"
+            shown.add_row(
+                found["title"] if first else "",
+                f"{level} %",
+                f"{reached['solved']}/{found['starts']}",
+                *(_show(reached[cost]) for cost in COSTS),
+                end_section=last,
+            )
+    return shown
+
+
+def _left(results: dict[str, Any]) -> Table:
+    budget = results["budget"]
+    shown = Table(
+        title=f"At the end, after {budget['evaluations']} evaluations or {budget['seconds']} s",
+        caption="Distance in units of the parameters. Compilation is not charged.",
+        box=box.SIMPLE_HEAD,
+    )
+    shown.add_column("method")
+    for column in ("image error", "parameter error", "distance", "compile"):
+        shown.add_column(column, justify="right")
+    for found in able(results).values():
+        errors = [_show(found[error]["final"]) for error in ERRORS]
+        compiling = f"{found['warm_up_seconds']:.1f} s"
+        shown.add_row(found["title"], *errors, _show(found["distance"]), compiling)
+    return shown
+
+
+def _show(quartiles: list[float | None]) -> str:
+    low, middle, high = (
+        "-" if q is None else f"{q:.2g}" if q < 10 else f"{q:.0f}" for q in quartiles
+    )
+    return middle if middle == low == high else f"{middle} \\[{low}, {high}]"

@@ -1,0 +1,53 @@
+"""One look for all figures: colours for colour-blind readers too, thin grids, no frames."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import cycle
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+from matplotlib.figure import Figure
+
+# Okabe and Ito 2008, without yellow, which is too pale for a line
+COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
+DASHES = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1, 1, 1, 1, 1)))
+STYLE: dict[Any, Any] = {
+    "font.size": 9,
+    "axes.titlesize": 10,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "0.9",
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+    "lines.linewidth": 1.8,
+    "figure.dpi": 100,
+    "savefig.dpi": 200,
+    "figure.constrained_layout.use": True,
+}
+
+
+@contextmanager
+def figure(path: Path, rows: int, columns: int, size: tuple[float, float]) -> Iterator[tuple]:
+    """A figure with rows x columns axes, (figure, axes), saved and closed at the end."""
+    with plt.rc_context(STYLE):
+        drawn: Figure
+        drawn, axes = plt.subplots(rows, columns, figsize=size, squeeze=False)
+        yield drawn, axes
+        path.parent.mkdir(parents=True, exist_ok=True)
+        drawn.savefig(path)
+        plt.close(drawn)
+
+
+def looks(names) -> dict[str, dict]:
+    """A colour and a dash for each name, the same in every figure."""
+    return {
+        name: {"color": colour, "linestyle": dash}
+        for name, colour, dash in zip(names, cycle(COLOURS), cycle(DASHES), strict=False)
+    }

@@ -1,0 +1,112 @@
+"""From runs to numbers: medians and quartiles over the starts, of errors and of what they took.
+
+Errors are relative to those of the start. A level of 99 % is reached at the first point of a run
+whose error is at most 1 % of the start's. A run that never gets there took infinitely long, so a
+median is infinite when half of the runs do not get there.
+"""
+
+import math
+import os
+import platform
+from collections.abc import Sequence
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+
+from benchmarks._harness import Run
+from benchmarks._task import Method, NotAble, Task
+
+LEVELS = {"90": 0.1, "99": 0.01, "99.9": 0.001}
+ERRORS = ("image_error", "parameter_error")
+COSTS = ("evaluations", "seconds")
+PACKAGES = ("smoothdiff", "jax", "jaxlib", "optax", "optimistix", "numpy", "mitsuba", "cma")
+
+
+def summarise(
+    task: Task, runs: dict[Method, list[Run] | NotAble], setting: str, command: str
+) -> dict[str, Any]:
+    """What is written to results.json."""
+    return {
+        "task": task.name,
+        "title": task.title,
+        "setting": setting,
+        "notes": task.notes,
+        "budget": task.budget._asdict(),
+        "sigma": task.sigma,
+        "command": command,
+        "machine": machine(),
+        "methods": {
+            method.name: {"title": method.title}
+            | ({"not_able": str(found)} if isinstance(found, NotAble) else _of_method(found))
+            for method, found in runs.items()
+        },
+    }
+
+
+def _of_method(runs: list[Run]) -> dict[str, Any]:
+    return {
+        "starts": len(runs),
+        "warm_up_seconds": runs[0]["warm_up_seconds"],
+        "distance": _quartiles([run["distance"] for run in runs]),
+        **{
+            error: {
+                "final": _quartiles([run[error][-1] for run in runs]),
+                "levels": {name: _level(runs, error, level) for name, level in LEVELS.items()},
+            }
+            for error in ERRORS
+        },
+        "runs": [{k: v for k, v in run.items() if k != "fingerprint"} for run in runs],
+    }
+
+
+def _level(runs: list[Run], error: str, level: float) -> dict[str, Any]:
+    costs = {cost: [cost_to_level(run[error], run[cost], level) for run in runs] for cost in COSTS}
+    solved = sum(math.isfinite(cost) for cost in costs["evaluations"])
+    return {"solved": solved} | {cost: _quartiles(values) for cost, values in costs.items()}
+
+
+def cost_to_level(errors: Sequence[float], costs: Sequence[float], level: float) -> float:
+    """The cost at which the error is first at most `level`; infinite if it never is."""
+    return next((c for e, c in zip(errors, costs, strict=True) if e <= level), math.inf)
+
+
+def _quartiles(values: Sequence[float]) -> list[float | None]:
+    """Lower quartile, median, upper quartile; None stands for infinity, which JSON lacks."""
+    # "higher" takes values as they are: between a number and infinity there is no mean
+    quartiles = np.quantile(values, [0.25, 0.5, 0.75], method="higher")
+    return [float(q) if math.isfinite(q) else None for q in quartiles]
+
+
+def band(runs: list[Run], error: str, cost: str, grid: np.ndarray) -> np.ndarray:
+    """Quartiles of the error over the runs, at each cost of the grid, (3, grid)."""
+    errors = []
+    for run in runs:
+        last = np.searchsorted(run[cost], grid, side="right") - 1  # a run stays where it stopped
+        errors.append(np.asarray(run[error])[last])
+    return np.quantile(errors, [0.25, 0.5, 0.75], axis=0)
+
+
+def machine() -> dict[str, Any]:
+    """Where the numbers come from."""
+    versions = {}
+    for package in PACKAGES:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    return {
+        "platform": platform.platform(),
+        "cpu": _cpu(),
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+        "versions": versions,
+    }
+
+
+def _cpu() -> str:
+    try:
+        with open("/proc/cpuinfo") as lines:
+            return next(line.split(":")[1].strip() for line in lines if "model name" in line)
+    except (OSError, StopIteration):
+        return platform.processor()

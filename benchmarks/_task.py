@@ -1,0 +1,91 @@
+"""What a task is: a black box to minimise, where to start, and what counts as found.
+
+A method sees a task, prepares itself for it once, and is then run from several starts. It tells the
+harness where it is after each iteration and is stopped by it.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeAlias
+
+import jax
+import numpy as np
+
+Y: TypeAlias = Any  # the parameters: an array or a pytree of arrays
+Key: TypeAlias = jax.Array
+Loss: TypeAlias = Callable[[Y], jax.Array]
+Record: TypeAlias = Callable[[Y], None]
+Solve: TypeAlias = Callable[[Y, Key, Record], None]
+NativeAD: TypeAlias = Callable[[Y], tuple[Any, Y]]
+
+
+class NotAble(Exception):
+    """A method cannot run on this task or on this machine; the message says what it needs."""
+
+
+class Budget(NamedTuple):
+    """Where a run ends, whichever comes first. Seconds do not include compilation."""
+
+    evaluations: int
+    seconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A black box to minimise.
+
+    A task is written in coordinates in which one sigma fits all parameters, so that a method needs
+    to know nothing else about the units.
+
+    Args:
+        name: The name on the command line and of the folder of results.
+        title: What is sought, in one line.
+        loss: The black box that is optimised, a JAX function y -> scalar. Each call is counted.
+        exact_loss: The loss without noise, for the score only. Not counted.
+        start: The start of a seed, seed -> y.
+        reference: The y that is sought.
+        bounds: (low, high), each like y.
+        sigma: The scale of the parameters: about how far one has to look around.
+        budget: Where a run ends.
+        seeds: How many starts there are.
+        image: A picture of y without noise, y -> (H, W, 3) linear RGB, or None. Not counted.
+        native_ad: Gives y -> (loss, gradient) by the renderer's own AD, or None. It raises NotAble
+            where that cannot run.
+        notes: Facts that belong beside the results, resolution and variant, say.
+    """
+
+    name: str
+    title: str
+    loss: Loss
+    exact_loss: Loss
+    start: Callable[[int], Y]
+    reference: Y
+    bounds: tuple[Y, Y]
+    sigma: float
+    budget: Budget
+    seeds: int
+    image: Callable[[Y], jax.Array] | None = None
+    native_ad: Callable[[], NativeAD] | None = None
+    notes: str = ""
+
+    def distance(self, y: Y) -> float:
+        """The Euclidean distance of y from the reference."""
+        squares = jax.tree.map(
+            lambda a, b: np.sum((np.asarray(a, float) - np.asarray(b, float)) ** 2),
+            y,
+            self.reference,
+        )
+        return float(np.sqrt(sum(jax.tree.leaves(squares))))
+
+
+class Method(NamedTuple):
+    """A way to solve tasks: `prepare(task)` gives `solve(y0, key, record)`.
+
+    What is compiled lives in `prepare`, so that it is compiled once for all starts. `solve` calls
+    `record(y)` after each iteration and runs until record ends it, or until it has converged.
+    """
+
+    name: str
+    title: str
+    prepare: Callable[[Task], Solve]
+    source: str  # a change of it makes earlier results stale
