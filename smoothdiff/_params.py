@@ -64,8 +64,11 @@ class Layout:
     def vector(self, leaves: Sequence[Any]) -> Array:
         """One vector from one entry per leaf, each broadcast to the shape of its leaf."""
         parts = [
-            jnp.broadcast_to(jnp.asarray(leaf).astype(self.dtype), shape).reshape(-1)
-            for leaf, shape, keep in zip(leaves, self.shapes, self.smoothed, strict=True)
+            # rounded to the leaf's own dtype first, so that what is at a bound stays at it
+            jnp.broadcast_to(jnp.asarray(leaf).astype(dtype).astype(self.dtype), shape).reshape(-1)
+            for leaf, shape, dtype, keep in zip(
+                leaves, self.shapes, self.dtypes, self.smoothed, strict=True
+            )
             if keep
         ]
         return parts[0] if len(parts) == 1 else jnp.concatenate(parts)
@@ -229,8 +232,8 @@ def _check_sigma(sigma: Any, leaf: Array, name: str) -> None:
 def _sigma_fits(sigma: Any, leaf: Array) -> Array:
     """What `_check_sigma` asks for, of values that are traced."""
     width = jnp.broadcast_to(jnp.asarray(sigma).astype(leaf.dtype), leaf.shape)
-    spacing = jnp.spacing(jnp.abs(jax.lax.stop_gradient(leaf)))
-    return jnp.all((width > 0) & (width < jnp.inf) & ~(width < spacing))
+    theta = jax.lax.stop_gradient(leaf)
+    return jnp.all((theta + width / 2 > theta) & (width < jnp.inf))
 
 
 def _sides(side: PyTree, default: float, target: PyTree) -> list:

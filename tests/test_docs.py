@@ -1,0 +1,61 @@
+"""Every public name is documented, and every example in a docstring runs."""
+
+import doctest
+import importlib
+import inspect
+import pkgutil
+
+import jax
+import pytest
+
+import smoothdiff as sd
+
+MODULES = sorted(module.name for module in pkgutil.walk_packages(sd.__path__, prefix="smoothdiff."))
+TRANSFORMS = sorted(name for name in sd.__all__ if name.startswith("smooth"))
+# modules of optional extras import what the test extra brings
+EXAMPLES = ["smoothdiff", *MODULES]
+
+
+@pytest.mark.parametrize("name", sd.__all__)
+def test_public_names_are_documented(name):
+    thing = getattr(sd, name)
+    doc = inspect.getdoc(thing)
+    assert doc
+    # eqx.Module and NamedTuple make up a docstring where there is none
+    assert not doc.startswith(f"{name}(")
+    if inspect.isclass(thing):
+        for method, value in vars(thing).items():
+            if callable(value) and not method.startswith("_"):
+                assert inspect.getdoc(getattr(thing, method)), f"{name}.{method}"
+
+
+@pytest.mark.parametrize("name", TRANSFORMS)
+def test_transforms_say_all_there_is_to_say(name):
+    doc = inspect.getdoc(getattr(sd, name)) or ""
+    first, blank = doc.splitlines()[:2]
+    assert first.endswith(".")
+    assert not blank
+    for section in ("Args:", "Returns:", "Raises:", "Example:", "Source:"):
+        assert f"\n{section}" in doc, section
+    for parameter in inspect.signature(getattr(sd, name)).parameters:
+        if parameter in ("fun", "sigma"):
+            assert f"{parameter}: " in doc
+        else:
+            # the options are the same for all transforms, and described once
+            assert f"{parameter}: " in (inspect.getdoc(sd.Options) or ""), parameter
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_examples_run(name):
+    module = importlib.import_module(name)
+    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
+    # an example is what a user types: promotion and ranks as JAX has them by default
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        for example in doctest.DocTestFinder(exclude_empty=True).find(module, name):
+            assert runner.run(example).failed == 0
+
+
+def test_the_transforms_have_examples():
+    finder = doctest.DocTestFinder()
+    for name in TRANSFORMS:
+        assert any(test.examples for test in finder.find(getattr(sd, name), name)), name

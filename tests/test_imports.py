@@ -1,0 +1,38 @@
+"""What `import smoothdiff` costs, in a fresh interpreter."""
+
+import json
+import statistics
+import subprocess
+import sys
+
+# one process: the neighbours first, so that what remains is smoothdiff's own
+SCRIPT = """
+import json, sys, time
+import jax, optax, optimistix
+before = set(sys.modules)
+start = time.perf_counter()
+import smoothdiff
+seconds = time.perf_counter() - start
+print(json.dumps({"seconds": seconds, "before": sorted(before), "after": sorted(sys.modules)}))
+"""
+ALONE = "import json, sys, smoothdiff; print(json.dumps(sorted(sys.modules)))"
+HEAVY = ("mitsuba", "drjit", "matplotlib", "dask", "distributed", "cma", "IPython", "scipy.stats")
+
+
+def fresh(script):
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""  # no warnings either
+    return json.loads(done.stdout)
+
+
+def test_import_brings_nothing_heavy_or_optional():
+    loaded = fresh(ALONE)
+    assert "smoothdiff" in loaded
+    assert [name for name in HEAVY if name in loaded] == []
+
+
+def test_import_adds_less_than_a_fifth_of_a_second():
+    runs = [fresh(SCRIPT) for _ in range(3)]
+    assert "smoothdiff" not in runs[0]["before"]
+    assert statistics.median(run["seconds"] for run in runs) < 0.2
