@@ -37,13 +37,18 @@ def evaluate(key: jax.Array, y: jax.Array) -> jax.Array:
 
 def transforms() -> dict[str, Callable]:
     """What is timed, each as a function of key and y."""
-    options: dict[str, Any] = {"num_samples": SAMPLES, "sampler": SAMPLER}
-    hvp = sd.smooth_hvp(box10_loss, SIGMA, **options)
-    return {
-        "smooth_grad": sd.smooth_grad(box10_loss, SIGMA, **options),
-        "smooth_hessian": sd.smooth_hessian(box10_loss, SIGMA, **options),
-        "smooth_hvp": lambda key, y: hvp(key, y, jnp.ones_like(y)),
-    }
+    timed = {}
+    for baseline in ("mean", "gp"):
+        options: dict[str, Any] = {
+            "num_samples": SAMPLES,
+            "sampler": SAMPLER,
+            "baseline": baseline,
+        }
+        hvp = sd.smooth_hvp(box10_loss, SIGMA, **options)
+        timed[f"smooth_grad, {baseline}"] = sd.smooth_grad(box10_loss, SIGMA, **options)
+        timed[f"smooth_hessian, {baseline}"] = sd.smooth_hessian(box10_loss, SIGMA, **options)
+        timed[f"smooth_hvp, {baseline}"] = lambda key, y, hvp=hvp: hvp(key, y, jnp.ones_like(y))
+    return timed
 
 
 def time_pairs(first: Callable, second: Callable, pairs: int) -> np.ndarray:
@@ -103,7 +108,7 @@ def _table(results: dict[str, Any], pairs: int) -> Table:
 
 
 def _draw(results: dict[str, Any], path: Path) -> None:
-    with figure(path, 1, 1, (5, 2.2)) as (_, axes):
+    with figure(path, 1, 1, (5, 3.2)) as (_, axes):
         axis = axes[0, 0]
         ratios = np.array([found["ratio"] for found in results.values()])
         spread = np.abs(ratios[:, [0, 2]] - ratios[:, [1]]).T

@@ -1,18 +1,18 @@
 """The papers' aggregate importance sampler: one set of points for all elements of a derivative."""
 
+import math
 from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from smoothdiff import kernels
 from smoothdiff._samplers import PointSampler
 
 # density of the positivised first and second derivative of a normal, over the normal density
-_FIRST = np.sqrt(np.pi / 2)
-_SECOND = np.sqrt(2 * np.pi * np.e) / 4
+_FIRST = math.sqrt(math.pi / 2)
+_SECOND = math.sqrt(2 * math.pi * math.e) / 4
 
 
 class Aggregate(PointSampler):
@@ -67,7 +67,7 @@ class Aggregate(PointSampler):
         element = jnp.minimum((u[:, n] * count).astype(jnp.int32), count - 1)
         special = (u[:, n + 1] >= self.share)[:, None]
         u = u[:, :n]
-        dims = jnp.arange(n)[None]
+        dims = jnp.arange(n, dtype=element.dtype)[None]
         normal, first = kernels.inverse_cdf(u, 1.0, 0), kernels.inverse_cdf(u, 1.0, 1)
         if self.order == 1:
             z = jnp.where(special & (dims == element[:, None]), first, normal)

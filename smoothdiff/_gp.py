@@ -2,10 +2,12 @@ r"""The baseline "gp": Gaussian-process regression through the samples, smoothed
 
 The samples are not only weighted but also interpolated. With points z in units of sigma and
 
-$$ k(z, z') = c + \frac{z \cdot z'}{n} + \exp\Big(-\frac{|z - z'|^2}{2 \ell^2 n}\Big), $$
+$$ k(z, z') = \frac{z \cdot z'}{n} + \exp\Big(-\frac{|z - z'|^2}{2 \ell^2 n}\Big), $$
 
-the fit $m(z) = \sum_j \alpha_j k(z, z_j)$, $\alpha = (K + \lambda I)^{-1} f$, has a smoothed value
-whose derivatives are known, and what it leaves, $f - m$, is small and goes through the weights.
+the fit $m(z) = \beta + \sum_j \alpha_j k(z, z_j)$, $\alpha = (K + \lambda I)^{-1} (f - \beta)$ with
+$\sum_j \alpha_j = 0$, has a smoothed value whose derivatives are known, and what it leaves,
+$f - m$, is small and goes through the weights. The constant $\beta$ is free: a prior for it would
+let some of each sample's own value into the fit that leaves it out.
 """
 
 from typing import Any, ClassVar
@@ -18,10 +20,6 @@ from jaxtyping import Array, Float, PyTree
 from smoothdiff._baselines import AbstractBaseline, Control
 from smoothdiff._draws import Draws
 from smoothdiff._leave_out import group_share, leave_out, left_out_group
-
-# The weight of the constant in the kernel: the level of f is nearly free, and what is left of it
-# after the plain mean is subtracted is not worth float32's digits.
-_CONSTANT = 10.0
 
 
 class GPControl(Control):
@@ -44,7 +42,7 @@ class GPControl(Control):
         m = s * shift
 
         def chunk(start, z, log_ratio, alpha):
-            row = _CONSTANT + jnp.matmul(z, m, precision="highest") / shift.size
+            row = jnp.matmul(z, m, precision="highest") / shift.size
             if self.length is not None:
                 square = self.length**2 * shift.size
                 narrow = 1 / (square + s**2)
@@ -63,8 +61,8 @@ class GaussianProcess(AbstractBaseline):
     r"""Subtracts a Gaussian-process regression of the function on the samples: baseline="gp".
 
     For independent samples the fit that is subtracted from a sample leaves that sample out, in
-    closed form, so the estimate is unbiased but for terms of order $\lambda / (c N)$ times the
-    level of f. A single scrambled point set is fitted as a whole, which is far more accurate there
+    closed form, so the estimate is unbiased; where there are no others nothing is subtracted. A
+    single scrambled point set is fitted as a whole, which is far more accurate there
     and biased: it shrinks derivatives, by 1 % at N = 64 for a step in three dimensions and by 8 %
     for a cubic. It costs about $N^3$ operations and an N x N matrix, so use it up to a few
     thousand samples, where an evaluation is what costs.
@@ -97,27 +95,40 @@ class GaussianProcess(AbstractBaseline):
     def __call__(self, values, draws, log_ratio, valid, center):
         self.check_gaussian(draws)
         counts = jnp.ones(draws.num, draws.dtype) if valid is None else valid.astype(draws.dtype)
+        group = left_out_group(draws)
+        share = group_share(counts, group or 1)
+        # a group that is alone has no others to be fitted to: nothing is subtracted from it
+        free = (jnp.max(share) < 1).astype(draws.dtype)
         gram = self._gram(draws) * (counts[:, None] * counts[None, :])
         unit = jnp.eye(draws.num, dtype=draws.dtype)
         factor = jax.scipy.linalg.cho_factor(gram + self.ridge * unit)
-        inverse = jax.scipy.linalg.cho_solve(factor, unit)
+        ones = jax.scipy.linalg.cho_solve(factor, counts)
+        mean = free * ones / jnp.dot(counts, ones, precision="highest")
+
+        def solve(y: Array) -> tuple[Array, Array]:
+            """The coefficients and the constant of the fit to values y."""
+            constant = jnp.matmul(mean, y, precision="highest")
+            return jax.scipy.linalg.cho_solve(factor, y) - ones[:, None] * constant[None], constant
+
+        inverse, _ = solve(unit)
         blocks = lambda index: inverse[index[:, :, None], index[:, None, :]]
-        group = left_out_group(draws)
 
         def fit(v: Array) -> tuple[Array, ...]:
             flat = v.reshape(draws.num, -1)
+            # the level first, or its rounding would be all that is left of small differences
             level = jnp.matmul(
-                (counts / jnp.sum(counts)).astype(v.dtype), flat, precision="highest"
+                (free * counts / jnp.sum(counts)).astype(v.dtype), flat, precision="highest"
             )
             small = (flat - level[None]).astype(draws.dtype) * counts[:, None]
-            alpha = jax.scipy.linalg.cho_solve(factor, small)
+            alpha, constant = solve(small)
             left_out = leave_out(alpha, blocks, group or 1)
             residual = self.ridge * alpha
             if group is not None:
-                # every group's fit counts by its share of the samples
+                # every group's fit counts by its share of the samples, and is the fit to values
+                # that differ from the true ones by what it leaves of its own group
                 residual = left_out
-                weighted = left_out * group_share(counts, group)[:, None]
-                alpha = alpha - jax.scipy.linalg.cho_solve(factor, weighted)
+                alpha, constant = solve(small - left_out * share[:, None])
+            level += constant.astype(v.dtype)
             rows = (a.astype(v.dtype).reshape(v.shape) for a in (residual, left_out, alpha))
             return *rows, level.reshape(v.shape[1:])
 
@@ -133,7 +144,7 @@ class GaussianProcess(AbstractBaseline):
         def rows(z: Array, _: Any) -> Array:
             def columns(y: Array, _: Any) -> Array:
                 dot = jnp.matmul(y, z.T, precision="highest")
-                out = _CONSTANT + dot / draws.n
+                out = dot / draws.n
                 if self.length is not None:
                     apart = jnp.sum(y * y, axis=1)[:, None] + jnp.sum(z * z, axis=1)[None] - 2 * dot
                     out += jnp.exp(-jnp.maximum(apart, 0) / (2 * self.length**2 * draws.n))

@@ -10,12 +10,14 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from smoothdiff._baselines import AbstractBaseline, Control
+from smoothdiff._draws import Draws
 from smoothdiff._gp import GaussianProcess
 from smoothdiff._leave_out import group_share, leave_out, left_out_group
 
 Terms = Literal["linear", "diagonal", "full"]
 
-# so many samples for each coefficient, or a smaller model is more accurate
+# so many samples for each coefficient, or a smaller model is more accurate; and one more, or the
+# variance of a fit with few coefficients is infinite
 _SAMPLES_PER_TERM = 1.5
 
 
@@ -49,6 +51,8 @@ class LeastSquares(AbstractBaseline):
     For a quadratic function and enough samples, (n+1)(n+2) for example, gradient and Hessian are
     exact to rounding. With fewer than 1.5 samples for each of its coefficients, the full quadratic
     gives way to one without mixed terms, that to a linear function, and that to ridge regression.
+    An antithetic pair counts as one sample of the odd and one of the even coefficients; samples
+    that may be dropped count half.
 
     For independent samples the fit that is subtracted from a sample leaves that sample (pair,
     frame, replicate) out, in closed form, so the estimate is unbiased. A single scrambled point
@@ -82,7 +86,7 @@ class LeastSquares(AbstractBaseline):
     def __call__(self, values, draws, log_ratio, valid, center):
         self.check_gaussian(draws)
         group = None if self.in_sample else left_out_group(draws)
-        terms = self._terms(draws.num - (group or 0), draws.n)
+        terms = self._terms(draws, group or 0, may_drop=valid is not None)
         if terms is None:
             return GaussianProcess(length=None, ridge=1.0)(values, draws, log_ratio, valid, center)
         counts = jnp.ones(draws.num, draws.dtype) if valid is None else valid.astype(draws.dtype)
@@ -119,14 +123,20 @@ class LeastSquares(AbstractBaseline):
         )
         return PolynomialControl(residual, left_out, coefficients, terms)
 
-    def _terms(self, samples: int, n: int) -> Terms | None:
+    def _terms(self, draws: Draws, left_out: int, *, may_drop: bool) -> Terms | None:
         """The largest model that the samples determine well; None if not even the linear one."""
+        n = draws.n
         sizes: dict[Terms, int] = {"linear": n + 1}
         if self.degree == 2:
             sizes |= {"diagonal": 2 * n + 1, "full": math.comb(n + 2, 2)}
+        samples = (draws.num // 2 if may_drop else draws.num) - left_out
+        paired = getattr(draws.sampler, "antithetic", False)
+        if paired:
+            samples //= 2
         best: Terms | None = None
         for terms, size in sizes.items():
-            if samples >= _SAMPLES_PER_TERM * size:
+            determined = max(n, size - n) if paired else size
+            if samples >= _SAMPLES_PER_TERM * determined + 1:
                 best = terms
         return best
 

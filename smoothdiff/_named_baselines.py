@@ -6,7 +6,25 @@ from smoothdiff._baselines import AbstractBaseline, Center, Mean, NoBaseline
 from smoothdiff._gp import GaussianProcess
 from smoothdiff._least_squares import LeastSquares
 
+# Beyond, the regression's N^3 operations are worth more samples than the error that they save
+_MOST_SAMPLES = 1024
+
+
+class Auto(AbstractBaseline):
+    """The default, "auto": "gp" where it is known to gain, else "mean".
+
+    That is with at least as many samples as parameters (fewer leave nothing to interpolate) and at
+    most 1,024 samples (beyond, N^3 operations are worth more samples), for Gaussian smoothing of
+    an objective without a support.
+    """
+
+    def __call__(self, values, draws, log_ratio, valid, center):
+        gains = draws.sampler.gaussian and draws.n <= draws.num <= _MOST_SAMPLES
+        return (GaussianProcess() if gains else Mean())(values, draws, log_ratio, valid, center)
+
+
 NAMED: dict[str, Callable[[], AbstractBaseline]] = {
+    "auto": Auto,
     "none": NoBaseline,
     "mean": Mean,
     "center": Center,

@@ -1,12 +1,12 @@
 """Where to sample: the points z at which a smoothed function is evaluated, x = theta + sigma z."""
 
 import abc
+import math
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Key
 
 from smoothdiff._uniform import midpoints, uniform_bits
@@ -261,7 +261,7 @@ class Uniform(PointSampler):
 
     def points(self, u, n):
         z = self.half_width * (2 * u - 1)
-        constant = n * np.log(2 * self.half_width / np.sqrt(2 * np.pi))
+        constant = n * math.log(2 * self.half_width / math.sqrt(2 * math.pi))
         return z, constant - jnp.sum(z * z, axis=1) / 2
 
 

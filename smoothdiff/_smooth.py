@@ -15,7 +15,6 @@ from smoothdiff._importance import Importance, elementwise
 from smoothdiff._named_baselines import as_baseline
 from smoothdiff._params import Params, choose, replace
 from smoothdiff._quadratic import HessianOperator, QuadraticModel
-from smoothdiff._samplers import Gaussian
 from smoothdiff._stderr import (
     free_grad_stderr,
     grad_stderr,
@@ -24,7 +23,7 @@ from smoothdiff._stderr import (
 )
 
 
-@transform(sampler=Gaussian(antithetic=True))
+@transform()
 def smooth(call: Call) -> Callable:
     r"""The function convolved with a Gaussian, as a function of a key that JAX can differentiate.
 
@@ -71,7 +70,7 @@ def smooth(call: Call) -> Callable:
     return g
 
 
-@transform(sampler=Gaussian(antithetic=True))
+@transform()
 def smooth_value_and_grad(call: Call) -> Callable:
     r"""Value and gradient of the smoothed function from one batch, like `jax.value_and_grad`.
 
@@ -114,7 +113,7 @@ def smooth_value_and_grad(call: Call) -> Callable:
     return g
 
 
-@transform(sampler=Gaussian(antithetic=True))
+@transform()
 def smooth_grad(call: Call) -> Callable:
     r"""The gradient of the smoothed function, like `jax.grad`.
 
@@ -186,7 +185,7 @@ def _first_order(call: Call, key: Any, args: tuple, params: Params) -> tuple:
     )
 
 
-@transform(sampler=Gaussian(antithetic=True))
+@transform()
 def smooth_jacobian(call: Call) -> Callable:
     r"""The Jacobian of the smoothed function, like `jax.jacfwd` and `jax.jacrev`.
 
@@ -246,8 +245,6 @@ def smooth_hessian(call: Call) -> Callable:
 
     $$ \nabla^2 F(\theta)
        \approx \frac{1}{N} \sum_i w_i (f_i - b_i) \, \frac{z_i z_i^T - I}{\sigma^2} $$
-
-    Antithetic pairs do not help here, so the default sampler has none.
 
     Args:
         fun: a function with a scalar output.

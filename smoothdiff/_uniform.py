@@ -14,7 +14,7 @@ MAX_DIMENSION = 21_201
 def uniform_bits(
     key: Key[Array, ""], rows: Int[Array, " m"], dims: int, size: int | None
 ) -> UInt32[Array, "m dims"]:
-    """Uniform 32-bit numbers, each row from the key and its index alone.
+    """Uniform 32-bit numbers, each row from the key and its index alone; rows are consecutive.
 
     With a `size` they are quasi-random: rows come in sets of that many, each a Sobol sequence
     scrambled on its own. Dimensions beyond `MAX_DIMENSION` stay independent.
@@ -23,10 +23,13 @@ def uniform_bits(
     parts = []
     if size is not None:
         seeds = jax.vmap(
-            lambda set_: jax.random.bits(jax.random.fold_in(key, set_), (even,), jnp.uint32)
+            lambda set_: jax.random.bits(jax.random.fold_in(key, set_), (2, even), jnp.uint32)
         )
         index = (rows % size).astype(jnp.uint32)
-        parts.append(_scramble(_sobol(index, even, size), seeds(rows // size)))
+        # as many sets as so many consecutive rows can touch
+        sets = rows[0] // size + jnp.arange((rows.size + size - 2) // size + 1)
+        own_seeds = seeds(sets)[rows // size - sets[0]]
+        parts.append(_scramble(_sobol(index, even, size), own_seeds))
     if dims > even:
         # another branch of the key than the seeds'
         own = key if size is None else jax.random.fold_in(key, np.uint32(2**32 - 1))
@@ -71,14 +74,21 @@ def _sobol(index: UInt32[Array, " m"], n: int, size: int) -> UInt32[Array, "m n"
     return point
 
 
-def _scramble(x: UInt32[Array, "m n"], seed: UInt32[Array, "m n"]) -> UInt32[Array, "m n"]:
+def _scramble(x: UInt32[Array, "m n"], seeds: UInt32[Array, "m 2 n"]) -> UInt32[Array, "m n"]:
     """Owen's nested uniform scrambling: a hash in which each bit depends on higher bits only.
 
-    Source: B. Burley, Practical hash-based Owen scrambling (JCGT 2020).
+    The first seed makes each point exactly uniform, the second makes the bits of two points
+    independent beyond the first in which they differ.
+
+    Source: B. Burley, Practical hash-based Owen scrambling (JCGT 2020), with the better hash of
+    N. Vegdahl, Building a better LK hash (2021).
     """
-    x = _reverse_bits(x) + seed
-    for factor in (0x6C50B47C, 0xB82F1E52, 0xC7AFE638, 0x8D22F6E6):
-        x ^= x * np.uint32(factor)
+    x = _reverse_bits(x) + seeds[:, 0]
+    x ^= x * np.uint32(0x3D20ADEA)
+    x += seeds[:, 1]
+    x *= (seeds[:, 1] >> np.uint32(16)) | np.uint32(1)
+    x ^= x * np.uint32(0x05526C56)
+    x ^= x * np.uint32(0x53A22864)
     return _reverse_bits(x)
 
 

@@ -14,6 +14,7 @@ Source: Stochastic Gradient Estimation for Higher-order Differentiable Rendering
 (eq. 18 gives NaN as printed, eq. 52 is not a CDF; these are the mended forms).
 """
 
+import math
 from functools import lru_cache
 from typing import Literal
 
@@ -57,7 +58,7 @@ def derivative(x: Float[Array, "..."], sigma: float | Array = 1.0, order: Order 
     """
     _check(order)
     t = x / sigma
-    gauss = jnp.exp(-t * t / 2) / (np.sqrt(2 * np.pi) * sigma)
+    gauss = jnp.exp(-t * t / 2) / (math.sqrt(2 * math.pi) * sigma)
     return (1.0, -t / sigma, (t * t - 1) / sigma**2)[order] * gauss
 
 
@@ -88,7 +89,7 @@ def log_density(x: Float[Array, "..."], sigma: float | Array = 1.0, order: Order
     _check(order)
     t = jnp.abs(x / sigma)
     if order == 0:
-        return -t * t / 2 - jnp.log(np.sqrt(2 * np.pi) * sigma)
+        return -t * t / 2 - jnp.log(math.sqrt(2 * math.pi) * sigma)
     if order == 1:
         return jnp.log(t) - t * t / 2 - jnp.log(2.0 * sigma)
     return jnp.log(jnp.abs(t - 1) * (t + 1)) + (1 - t * t) / 2 - jnp.log(4.0 * sigma)
@@ -174,7 +175,7 @@ def _inverse_second(tail: Float[Array, "..."]) -> Array:
     cell = jnp.clip(jnp.searchsorted(-probability, -tail), 1, grid.size - 1)
     low, high = grid[cell - 1], grid[cell]
 
-    def narrow(_: int, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
+    def narrow(_: int | Array, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = bracket
         middle = (low + high) / 2
         hump = middle / 4 * jnp.exp((1 - middle * middle) / 2)

@@ -49,11 +49,11 @@ def test_leaves_keep_their_own_dtype(key, x64):
         return jnp.round(jnp.sum(p["wide"])) + jnp.round(jnp.sum(p["narrow"])).astype(jnp.float64)
 
     def everything(p):
-        model = sd.smooth_quadratic(fun, 0.5)(key, p)
+        model = sd.smooth_quadratic(fun, 0.5, **PLAIN)(key, p)
         like_p = (
-            sd.smooth_grad(fun, 0.5)(key, p),
-            *sd.smooth_grad(fun, 0.5, stderr=True)(key, p),
-            sd.smooth_hvp(fun, 0.5)(key, p, p),
+            sd.smooth_grad(fun, 0.5, **PLAIN)(key, p),
+            *sd.smooth_grad(fun, 0.5, **PLAIN, stderr=True)(key, p),
+            sd.smooth_hvp(fun, 0.5, **PLAIN)(key, p, p),
             model.hessian.mv(model.grad),
             model.stderr[1],
         )
@@ -102,9 +102,9 @@ def test_other_arguments_can_be_anything(stderr, key):
         sd.smooth_hessian,
         hvp,
     ):
-        g = make(fun, 0.5, stderr=stderr)
+        g = make(fun, 0.5, **PLAIN, stderr=stderr)
         jax.eval_shape(lambda g=g: g(key, x, *rest))
-    jax.eval_shape(lambda: sd.smooth_quadratic(fun, 0.5)(key, x, *rest))
+    jax.eval_shape(lambda: sd.smooth_quadratic(fun, 0.5, **PLAIN)(key, x, *rest))
 
 
 @pytest.mark.parametrize(("baseline", "rows"), [("mean", 8), ("center", 7)])
@@ -161,7 +161,8 @@ def test_leaves_with_sigma_none_are_differentiated_by_ad(key):
     row = lambda h: h["x"] @ p["x"] + h["y"] * p["y"]
     assert_same(product, {i: row(hessian[i]) for i in p})
     # what cannot be differentiated can still be passed
-    count = sd.smooth(lambda x, n: step(x) * n.astype(x.dtype), (0.5, None), argnums=(0, 1))
+    fun = lambda x, n: step(x) * n.astype(x.dtype)
+    count = sd.smooth(fun, (0.5, None), argnums=(0, 1), **PLAIN)
     assert jnp.isfinite(jax.jit(count)(key, p["x"], 3))
 
 

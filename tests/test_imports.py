@@ -10,9 +10,9 @@ SCRIPT = """
 import json, sys, time
 import jax, optax, optimistix
 before = set(sys.modules)
-start = time.perf_counter()
+start = time.process_time()
 import smoothdiff
-seconds = time.perf_counter() - start
+seconds = time.process_time() - start
 print(json.dumps({"seconds": seconds, "before": sorted(before), "after": sorted(sys.modules)}))
 """
 ALONE = "import json, sys, smoothdiff; print(json.dumps(sorted(sys.modules)))"
