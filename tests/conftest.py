@@ -1,4 +1,4 @@
-"""What every test runs under: strict dtypes and ranks, warnings as errors, x64 off unless asked for."""
+"""What every test runs under: strict dtypes and ranks, warnings as errors, x64 off by default."""
 
 import jax
 import pytest

@@ -72,7 +72,7 @@ def test_the_density_is_the_normalised_magnitude(order, dtype):
     )
 
 
-@pytest.mark.parametrize("order", (1, 2))
+@pytest.mark.parametrize("order", [1, 2])
 def test_the_density_vanishes_where_the_derivative_does(order):
     assert log_density(jnp.array((0.0, 0.0, 1.0)[order]), 1.0, order) == -jnp.inf
     assert jnp.isfinite(log_density(jnp.array(1e4), 1.0, order))
@@ -147,7 +147,7 @@ def test_single_precision_stays_so_where_double_is_on(fun, x64):
 
 
 @pytest.mark.parametrize("fun", FUNCTIONS)
-@pytest.mark.parametrize("order", (3, -1))
+@pytest.mark.parametrize("order", [3, -1])
 def test_another_order_is_refused(fun, order):
     # as users call it, without the type checker of the tests
     with pytest.raises(ValueError, match="order must be 0, 1 or 2"):

@@ -1,4 +1,4 @@
-"""Where to sample: every sampler's distribution, structure, addressing, and count of evaluations."""
+"""Every sampler: its distribution, structure, addressing, and count of evaluations."""
 
 import math
 from collections import Counter
@@ -16,7 +16,7 @@ import smoothdiff as sd
 from smoothdiff._samplers import as_sampler
 
 KEY = jax.random.key(0)
-GUMBEL, LOGISTIC = optax.perturbations.Gumbel(), optax.perturbations.Normal()
+GUMBEL = optax.perturbations.Gumbel()
 
 # sampler and a number of points that it can draw in three dimensions
 NORMAL = {
@@ -79,20 +79,21 @@ def test_weighted_points_have_the_moments_of_normal_ones(name):
 def test_rows_are_addressed_one_by_one(name):
     """Any part of a set can be drawn alone, also where its start is traced."""
     sampler, num = ALL[name]
-    n, many = 3, 6 * num
+    n, many = 3, 12 * num
     sampler.check(many, n)
-    whole = jax.jit(lambda: sampler.draw(KEY, 0, many, many, n, jnp.float32))()
-    block = sampler.block(many, n)
-    part = jax.jit(
-        lambda start, count: sampler.draw(KEY, start, count, many, n, jnp.float32),
-        static_argnums=1,
-    )
-    for start, blocks in ((0, 1), (block, 1), (many - 2 * block, 2), (block, many // block - 2)):
-        count = min(blocks * block, many - start)
-        for a, b in zip(part(start, count), whole, strict=True):
-            assert (a is None) == (b is None)
-            if a is not None and b is not None:
-                np.testing.assert_allclose(a, b[start : start + count], rtol=1e-5, atol=1e-6)
+    count = 2 * sampler.block(many, n)
+    starts = jnp.array([0, count, count // 2, many - count])
+
+    @jax.jit
+    def run():
+        part = lambda start, count: sampler.draw(KEY, start, count, many, n, jnp.float32)
+        return part(0, many), jax.lax.map(lambda start: part(start, count), starts)
+
+    whole, parts = run()
+    assert jax.tree.structure(whole) == jax.tree.structure(parts)
+    for a, b in zip(jax.tree.leaves(parts), jax.tree.leaves(whole), strict=True):
+        want = jnp.stack([b[start : start + count] for start in starts])
+        np.testing.assert_allclose(a, want, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -114,7 +115,7 @@ def test_pairs_mirror_each_other(name):
     np.testing.assert_array_equal(z[0::2], -z[1::2])
 
 
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", ["pairs", "sobol", "frames", "uniform, quasi pairs", "noise"])
 def test_other_keys_give_other_points(name):
     sampler, num = ALL[name]
     z, _ = draw(sampler, num, 3, keys(2000))
@@ -198,8 +199,8 @@ def test_sobol_beyond_the_tabulated_dimensions():
     even = np.all(np.sort(quarter, axis=0) == np.arange(4)[:, None], axis=0)
     assert np.all(even[:21_201])
     assert np.mean(even[21_201:]) < 0.4  # 4! / 4^4 of independent columns are so by chance
-    apart = np.corrcoef(np.concatenate([z[:, :200], z[:, -99:]]).reshape(2 * 4, -1)[:, :99])
-    assert apart.shape == (8, 8)
+    # random numbers of their own, not those that scramble the first ones
+    assert np.max(np.abs(np.corrcoef(z[:, :99], z[:, -99:]) - np.eye(8))) < 1
     g = sd.smooth_grad(lambda x: jnp.sum(x[-3:]), 1.0, sampler=sd.Sobol(), num_samples=4)
     assert jnp.all(jnp.isfinite(jax.jit(g)(KEY, jnp.zeros(n))))
 
@@ -269,8 +270,8 @@ def mixture(order, share, n):
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("share", [0.0, 0.1, 1.0])
 def test_aggregate_ratio_is_that_of_the_mixture(order, n, share, x64):
-    sampler = sd.Aggregate(order, share=share)
-    z, log_ratio = draw(sampler, 200, n, dtype=jnp.float64)
+    z = jax.random.normal(KEY, (200, n), jnp.float64) * 2
+    log_ratio = sd.Aggregate(order, share=share).log_ratio(z)
     points = np.asarray(z).T
     want = np.prod(stats.norm.pdf(points), axis=0) / mixture(order, share, n)(points)
     np.testing.assert_allclose(np.exp(log_ratio), want, rtol=1e-9)
@@ -280,7 +281,7 @@ def test_aggregate_ratio_is_that_of_the_mixture(order, n, share, x64):
 
 @pytest.mark.parametrize("order", [1, 2])
 def test_aggregate_density_is_normalised(order):
-    """The density over the normal one, from `draw` itself where it puts points, by quadrature."""
+    """By quadrature of the density over the normal one, in one and two dimensions."""
     nodes, weights = np.polynomial.legendre.leggauss(200)
     x = np.concatenate([(nodes + 1) / 2 * (b - a) + a for a, b in ((-8, -1), (-1, 0))])
     w = np.concatenate([weights / 2 * (b - a) for a, b in ((-8, -1), (-1, 0))])
@@ -292,8 +293,7 @@ def test_aggregate_density_is_normalised(order):
     np.testing.assert_allclose(4 * np.sum(volume * ratio(grid)), 1, rtol=1e-5)
 
 
-@pytest.mark.parametrize("quasi", [False, True])
-@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize(("order", "quasi"), [(1, True), (2, False)])
 def test_aggregate_points_follow_the_mixture(order, quasi):
     grid = np.linspace(-8, 8, 16_001)
     mass = integrate.cumulative_trapezoid(mixture(order, 0.1, 1)(grid[None]), grid, initial=0)
@@ -323,12 +323,11 @@ def test_the_share_keeps_weights_and_estimates_bounded():
             assert (jnp.max(jnp.abs(moment)) > 100) == (share == 0)
 
 
-@pytest.mark.parametrize("order", [1, 2])
-@pytest.mark.parametrize("share", [0.0, 0.1])
+@pytest.mark.parametrize(("order", "share"), [(1, 0.1), (2, 0.0)])
 def test_log_weights_in_ten_thousand_dimensions(order, share):
     n = 10_000
     sampler = sd.Aggregate(order, share=share)
-    z, log_ratio = draw(sampler, 16, n)
+    _z, log_ratio = draw(sampler, 16, n)
     assert log_ratio is not None
     assert jnp.all(jnp.isfinite(log_ratio))
     # the mean over ten thousand elements hardly varies
@@ -342,8 +341,7 @@ def test_log_weights_in_ten_thousand_dimensions(order, share):
     assert jnp.all(jnp.isfinite(jax.jit(hvp)(KEY, x, x + 1)))
 
 
-@pytest.mark.parametrize("half_width", [1.0, 3.0])
-@pytest.mark.parametrize("quasi", [False, True])
+@pytest.mark.parametrize(("half_width", "quasi"), [(1.0, False), (3.0, True)])
 def test_uniform_is_biased_by_what_it_cuts_off(half_width, quasi):
     """Its expectation is the integral of f times the Gaussian over the box, as documented."""
     sampler = sd.Uniform(half_width, quasi=quasi)
@@ -378,7 +376,7 @@ def counted(count):
     return lambda x: jax.pure_callback(host, out, x, vmap_method="expand_dims")
 
 
-@pytest.mark.parametrize("n", [1, 2, 5])
+@pytest.mark.parametrize("n", [1, 4])
 def test_evaluations_are_those_of_table_1(n):
     """Plain and aggregate sampling: N for all elements. By element: n N and n (n + 1) / 2 N.
 
@@ -409,11 +407,12 @@ def test_evaluations_are_those_of_table_1(n):
 # noise
 
 
-@pytest.mark.parametrize("noise", [GUMBEL, optax.perturbations.Normal()])
-@pytest.mark.parametrize("baseline", ["none", "mean"])
+@pytest.mark.parametrize(
+    ("noise", "baseline"), [(GUMBEL, "none"), (optax.perturbations.Normal(), "mean")]
+)
 def test_noise_smooths_as_in_optax(noise, baseline):
     """The same value and Jacobian in expectation as `make_perturbed_fun`."""
-    one_hot = lambda x: (x == jnp.max(x)).astype(x.dtype)
+    one_hot = lambda x: jax.nn.one_hot(jnp.argmax(x), 3, dtype=x.dtype)
     x, sigma = jnp.array([0.3, -0.2, 0.5]), 0.8
     ours = sd.smooth(one_hot, sigma, sampler=noise, num_samples=64, baseline=baseline)
     theirs = optax.perturbations.make_perturbed_fun(one_hot, 64, sigma, noise)
