@@ -55,24 +55,26 @@ class Aggregate(PointSampler):
         if not 0 <= self.share <= 1:
             raise ValueError(f"share must be between 0 and 1, not {self.share}")
 
+    def mirrored(self) -> bool:
+        return self.antithetic
+
     def scrambled_sets(self) -> int:
         return int(self.quasi)
 
     def uniforms(self, n: int) -> int:
-        # one number chooses the element, one whether to be a plain Gaussian
-        return n + 2
+        # each dimension of the element takes one, and so does whether to be a plain Gaussian
+        return n + 1 + self.order
 
     def points(self, u, n):
-        count = n if self.order == 1 else n * n
-        element = jnp.minimum((u[:, n] * count).astype(jnp.int32), count - 1)
-        special = (u[:, n + 1] >= self.share)[:, None]
+        special = (u[:, n] >= self.share)[:, None]
+        element = jnp.minimum((u[:, n + 1 :] * n).astype(jnp.int32), n - 1)
         u = u[:, :n]
         dims = jnp.arange(n, dtype=element.dtype)[None]
         normal, first = kernels.inverse_cdf(u, 1.0, 0), kernels.inverse_cdf(u, 1.0, 1)
         if self.order == 1:
-            z = jnp.where(special & (dims == element[:, None]), first, normal)
+            z = jnp.where(special & (dims == element), first, normal)
             return z, self.log_ratio(z)
-        i, j = (element // n)[:, None], (element % n)[:, None]
+        i, j = element[:, :1], element[:, 1:]
         z = jnp.where(special & ((dims == i) | (dims == j)), first, normal)
         # the inverse of order 2 is the dear one, and one number of each row needs it
         own = kernels.inverse_cdf(jnp.take_along_axis(u, i, axis=1), 1.0, 2)

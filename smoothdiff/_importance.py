@@ -86,6 +86,9 @@ class ElementSampler(PointSampler):
     quasi: bool = eqx.field(static=True)
     blur: Literal["all", "own"] = eqx.field(static=True)
 
+    def mirrored(self) -> bool:
+        return self.antithetic
+
     def scrambled_sets(self) -> int:
         return int(self.quasi)
 

@@ -59,10 +59,12 @@ class AbstractSampler(eqx.Module):
 class PointSampler(AbstractSampler):
     """A sampler that turns uniform numbers into points, one row into one point.
 
-    With `antithetic` every point comes with its mirror image; `num_samples` counts both.
+    Every point may come with its mirror image; `num_samples` counts both.
     """
 
-    antithetic: eqx.AbstractVar[bool]
+    @abc.abstractmethod
+    def mirrored(self) -> bool:
+        """Whether points come in pairs z, -z."""
 
     def scrambled_sets(self) -> int:
         """How many scrambled Sobol sequences the uniform numbers are; 0: they are independent."""
@@ -73,7 +75,7 @@ class PointSampler(AbstractSampler):
         return self.scrambled_sets() > 0
 
     def block(self, num_samples: int, n: int) -> int:
-        return 2 if self.antithetic else 1
+        return 2 if self.mirrored() else 1
 
     def group(self, num_samples: int, n: int) -> int:
         sets = self.scrambled_sets()
@@ -104,7 +106,7 @@ class PointSampler(AbstractSampler):
         size = self.group(num_samples, n) // block if self.balanced else None
         bits = uniform_bits(key, rows, self.uniforms(n), size)
         z, log_ratio = self.points(midpoints(bits, dtype), n)
-        if self.antithetic:
+        if self.mirrored():
             z = jnp.stack([z, -z], axis=1).reshape(count, n)
             log_ratio = None if log_ratio is None else jnp.repeat(log_ratio, 2)
         return z, log_ratio
@@ -132,6 +134,9 @@ class Gaussian(PointSampler):
     """
 
     antithetic: bool = eqx.field(static=True, default=False)
+
+    def mirrored(self) -> bool:
+        return self.antithetic
 
     def points(self, u, n):
         return jax.scipy.special.ndtri(u), None
@@ -173,6 +178,9 @@ class Sobol(PointSampler):
 
     def scrambled_sets(self) -> int:
         return self.replicates
+
+    def mirrored(self) -> bool:
+        return self.antithetic
 
     def points(self, u, n):
         return jax.scipy.special.ndtri(u), None
@@ -258,6 +266,9 @@ class Uniform(PointSampler):
 
     def scrambled_sets(self) -> int:
         return int(self.quasi)
+
+    def mirrored(self) -> bool:
+        return self.antithetic
 
     def points(self, u, n):
         z = self.half_width * (2 * u - 1)

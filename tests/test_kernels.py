@@ -58,8 +58,8 @@ def test_the_derivative_is_that_of_the_density(order, dtype):
     x = jnp.linspace(-4, 4, 101, dtype=dtype)
     found = derivative(x, SIGMA, order)
     assert found.dtype == dtype
-    np.testing.assert_allclose(found, jax.vmap(fun)(x), atol=200 * jnp.finfo(dtype).eps)
-    np.testing.assert_allclose(found, EXACT[order](x), atol=200 * jnp.finfo(dtype).eps)
+    np.testing.assert_allclose(found, jax.vmap(fun)(x), atol=200 * float(jnp.finfo(dtype).eps))
+    np.testing.assert_allclose(found, EXACT[order](x), atol=200 * float(jnp.finfo(dtype).eps))
 
 
 @pytest.mark.parametrize("order", ORDERS)
@@ -68,7 +68,7 @@ def test_the_density_is_the_normalised_magnitude(order, dtype):
     found = log_density(x, SIGMA, order)
     assert found.dtype == dtype
     np.testing.assert_allclose(
-        np.exp(found), density(order)(np.asarray(x, float)), rtol=1000 * jnp.finfo(dtype).eps
+        np.exp(found), density(order)(np.asarray(x, float)), rtol=1000 * float(jnp.finfo(dtype).eps)
     )
 
 
@@ -108,14 +108,14 @@ def test_the_tails_are_finite_and_right(order, dtype):
     outermost = 2.0 ** (-24 if dtype == jnp.float32 else -33)
     u = jnp.asarray([outermost, 3 * outermost, 1e-3], dtype)
     want = [
-        -SIGMA * optimize.brentq(lambda t, p=p: tail(t, order) - p, 0, 10, xtol=1e-14)
+        -SIGMA * optimize.brentq(lambda t, p=p: tail(t, order) - p, 0, 10, xtol=1e-14)  # pyright: ignore
         for p in np.asarray(u, float)
     ]
     lower = inverse_cdf(u, SIGMA, order)
-    np.testing.assert_allclose(lower, want, rtol=20 * jnp.finfo(dtype).eps)
+    np.testing.assert_allclose(lower, want, rtol=20 * float(jnp.finfo(dtype).eps))
     # both tails alike; in float32 1 - 2^-24 is the last number below 1
     np.testing.assert_allclose(
-        inverse_cdf(1 - u[:2], SIGMA, order), -lower[:2], rtol=20 * jnp.finfo(dtype).eps
+        inverse_cdf(1 - u[:2], SIGMA, order), -lower[:2], rtol=20 * float(jnp.finfo(dtype).eps)
     )
 
 
@@ -136,7 +136,9 @@ def test_jit_and_vmap_change_nothing(fun, order, dtype):
     sigma = jnp.asarray([0.5, 2.0], dtype)
     want = jnp.stack([fun(row, s, order) for row, s in zip(x, sigma, strict=True)])
     mapped = jax.vmap(jax.vmap(lambda x, s: fun(x, s, order), in_axes=(0, None)))
-    np.testing.assert_allclose(jax.jit(mapped)(x, sigma), want, atol=50 * jnp.finfo(dtype).eps)
+    np.testing.assert_allclose(
+        jax.jit(mapped)(x, sigma), want, atol=50 * float(jnp.finfo(dtype).eps)
+    )
 
 
 @pytest.mark.parametrize("fun", FUNCTIONS)
