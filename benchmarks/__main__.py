@@ -1,4 +1,4 @@
-"""The command line: `python -m benchmarks list | run TASK... | overhead`."""
+"""The command line: `python -m benchmarks list | run TASK... | overhead | variance`."""
 
 import argparse
 import json
@@ -26,14 +26,27 @@ def main(arguments: list[str] | None = None, results: Path = RESULTS) -> None:
     run.add_argument("--methods", metavar="A,B", help="only these, separated by commas")
     run.add_argument("--fresh", action="store_true", help="run again what has been run")
     commands.add_parser("overhead", help="derivatives against evaluating at the same points")
+    errors = commands.add_parser("variance", help="errors of derivatives, for what they cost")
+    errors.add_argument("--full", action="store_true", help="every estimator and problem")
+    errors.add_argument("--fresh", action="store_true", help="measure again, as the code changed")
     options = parser.parse_args(arguments)
+    command = " ".join(["python -m benchmarks", *arguments])
 
     if options.command == "list":
         _list()
     elif options.command == "run":
-        command = " ".join(["python -m benchmarks", *arguments])
         for task in options.tasks:
             _run(task, options, results / task, command)
+    elif options.command == "variance":
+        from benchmarks import variance
+
+        setting = variance.FULL if options.full else variance.QUICK
+        variance.main(results / "variance", setting, command=command, fresh=options.fresh)
+    elif options.command == "variance":
+        from benchmarks import variance as measured
+
+        setting = measured.FULL if options.full else measured.QUICK
+        measured.main(results / "variance", setting, command=command, fresh=options.fresh)
     else:
         from benchmarks import overhead
 

@@ -90,5 +90,5 @@ class Aggregate(PointSampler):
         else:
             second = _SECOND * jnp.abs(jnp.abs(z) - 1) * (jnp.abs(z) + 1)
             pairs = jnp.sum(first, axis=1) ** 2 - jnp.sum(first * first, axis=1)
-            mixture = (jnp.sum(second, axis=1) + pairs) / n**2
+            mixture = (jnp.sum(second, axis=1) + pairs) / float(n**2)
         return -jnp.log((1 - self.share) * mixture + self.share)
