@@ -1,4 +1,4 @@
-"""The command line: `python -m benchmarks list | run TASK... | overhead | variance`."""
+"""The command line: `python -m benchmarks list | run TASK... | overhead | variance | stress`."""
 
 import argparse
 import json
@@ -29,6 +29,7 @@ def main(arguments: list[str] | None = None, results: Path = RESULTS) -> None:
     errors = commands.add_parser("variance", help="errors of derivatives, for what they cost")
     errors.add_argument("--full", action="store_true", help="every estimator and problem")
     errors.add_argument("--fresh", action="store_true", help="measure again, as the code changed")
+    commands.add_parser("stress", help="stiff and extreme cases: expected, seen, verdict")
     options = parser.parse_args(arguments)
     command = " ".join(["python -m benchmarks", *arguments])
 
@@ -42,11 +43,10 @@ def main(arguments: list[str] | None = None, results: Path = RESULTS) -> None:
 
         setting = variance.FULL if options.full else variance.QUICK
         variance.main(results / "variance", setting, command=command, fresh=options.fresh)
-    elif options.command == "variance":
-        from benchmarks import variance as measured
+    elif options.command == "stress":
+        from benchmarks import stress
 
-        setting = measured.FULL if options.full else measured.QUICK
-        measured.main(results / "variance", setting, command=command, fresh=options.fresh)
+        stress.main(results / "stress")
     else:
         from benchmarks import overhead
 

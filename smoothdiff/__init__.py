@@ -12,15 +12,8 @@ from smoothdiff._least_squares import LeastSquares
 from smoothdiff._minimise import MinimiseError, Record, Result, minimise
 from smoothdiff._quadratic import HessianOperator, QuadraticModel
 from smoothdiff._samplers import AbstractSampler, Gaussian, Noise, Orthogonal, Sobol, Uniform
-from smoothdiff._smooth import (
-    smooth,
-    smooth_grad,
-    smooth_hessian,
-    smooth_hvp,
-    smooth_jacobian,
-    smooth_quadratic,
-    smooth_value_and_grad,
-)
+from smoothdiff._smooth import smooth, smooth_grad, smooth_jacobian, smooth_value_and_grad
+from smoothdiff._smooth_second import smooth_hessian, smooth_hvp, smooth_quadratic
 from smoothdiff._solvers.first_order import FirstOrder
 from smoothdiff._support import local_support, matrix_support, probe_support
 

@@ -31,7 +31,9 @@ class Aggregate(PointSampler):
     Args:
         order: 1 for gradients, 2 for Hessians and their products.
         antithetic: mirror every point, as in the paper.
-        quasi: quasi-random points instead of independent ones.
+        quasi: quasi-random points instead of independent ones. As one set is re-weighted as a
+            whole, baseline="mean" is then biased by O(1/N): the gradient of a step in one dimension
+            under order 2 by -8 % at N = 8, -2 % at 24 and -0.6 % at 64. With "none" it is not.
         share: of the plain Gaussian; 0 is the sampler as published.
 
     Example:

@@ -1,6 +1,7 @@
 """One call of a transform: its options, their checks, and the way to its batch and value."""
 
 import inspect
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import wraps
@@ -40,7 +41,8 @@ class Options(TypedDict, total=False):
         nonfinite: "propagate" a NaN or infinite sample into the estimate, or "drop" it and
             re-weight the others; NaN if fewer than half are left.
         has_aux: the function returns (value, aux); aux comes back with one row per sample.
-        stderr: also return the standard error of the estimate.
+        stderr: also return the standard error of the estimate. Do not differentiate what a
+            transform returns then: derivatives are lost, silently.
     """
 
     argnums: int | Sequence[int]
@@ -82,10 +84,6 @@ class Call:
             raise TypeError(f"the first argument must be a function, not {type(self.fun).__name__}")
         if self.nonfinite not in ("propagate", "drop"):
             raise ValueError(f'nonfinite must be "propagate" or "drop", not {self.nonfinite!r}')
-        for name in ("num_samples", "batch_size"):
-            value = getattr(self, name)
-            if value is not None and (not isinstance(value, int) or value < 1):
-                raise ValueError(f"{name} must be a positive integer, not {value!r}")
         extra = as_baseline(self.baseline).evaluations()
         if self.num_samples <= extra:
             raise ValueError(
@@ -171,6 +169,17 @@ class Transform(Protocol):
     ) -> Callable[..., Any]: ...
 
 
+def _positive(value: Any, name: str) -> int:
+    """The value as a Python int, which NumPy's integers are not."""
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = 0
+    if number < 1:
+        raise ValueError(f"{name} must be a positive integer, not {value!r}")
+    return number
+
+
 def transform(**defaults: Any) -> Callable[[Callable[[Call], Callable]], Transform]:
     """Gives a transform its options: defaults of its own, checks, and a signature that shows them.
 
@@ -185,8 +194,11 @@ def transform(**defaults: Any) -> Callable[[Callable[[Call], Callable]], Transfo
             unknown = sorted(set(options) - set(known))
             if unknown:
                 raise TypeError(f"{make.__name__} has no option {unknown}; it has {sorted(known)}")
-            call = Call(fun, sigma, **{**known, **options})
-            return make(call)
+            chosen: dict[str, Any] = {**known, **options}
+            chosen["num_samples"] = _positive(chosen["num_samples"], "num_samples")
+            if chosen["batch_size"] is not None:
+                chosen["batch_size"] = _positive(chosen["batch_size"], "batch_size")
+            return make(Call(fun, sigma, **chosen))
 
         hints = Options.__annotations__
         kind = inspect.Parameter

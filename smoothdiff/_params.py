@@ -88,6 +88,16 @@ class Layout:
             start = stop
         return self.treedef.unflatten(leaves)
 
+    def check_vector(self, v: PyTree) -> None:
+        """Raises ValueError if `v` is not like the parameters; nothing is broadcast."""
+        leaves, treedef = jax.tree.flatten(v)
+        if treedef != self.treedef or tuple(map(jnp.shape, leaves)) != self.shapes:
+            raise ValueError(
+                "v must have the structure and shapes of the parameters, "
+                f"{self.treedef.unflatten(self.shapes)}, not {jax.tree.map(jnp.shape, v)}: "
+                "smooth_hvp takes (key, x, v, *other_args), mv takes v"
+            )
+
 
 @dataclass(frozen=True)
 class Params:

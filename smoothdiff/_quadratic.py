@@ -28,9 +28,12 @@ class HessianOperator(lx.AbstractLinearOperator):
     layout: Layout = eqx.field(static=True)
 
     def mv(self, vector: PyTree) -> PyTree:
-        """The product with a vector that has the structure of the parameters."""
-        scaled = self.layout.vector(jax.tree.leaves(vector)) / self.sigma
-        return self.layout.tree(self._product(scaled) / self.sigma)
+        """The product with a vector of the structure and shapes of the parameters."""
+        return self.layout.tree(self._product(self._scaled(vector)) / self.sigma)
+
+    def _scaled(self, vector: PyTree) -> Float[Array, " n"]:
+        self.layout.check_vector(vector)
+        return self.layout.vector(jax.tree.leaves(vector)) / self.sigma
 
     def _product(self, direction: Float[Array, " n"]) -> Float[Array, " n"]:
         # in units of sigma
@@ -39,7 +42,7 @@ class HessianOperator(lx.AbstractLinearOperator):
 
     def stderr(self, vector: PyTree) -> PyTree:
         """The standard error of `mv(vector)`, elementwise and of the same structure."""
-        scaled = self.layout.vector(jax.tree.leaves(vector)) / self.sigma
+        scaled = self._scaled(vector)
         error = hvp_stderr(self.batch, scaled, self._product(scaled))
         return self.layout.tree(error / self.sigma)
 

@@ -138,6 +138,16 @@ def keys(num: int, seed: int = 0):
     return jax.random.split(jax.random.key(seed), num)
 
 
+def quadratic_model(fun: Callable, sigma, **options):
+    """Value, gradient and Hessian of the smoothed function as arrays, for a key and parameters."""
+
+    def g(key, x):
+        made = sd.smooth_quadratic(fun, sigma, **options)(key, x)
+        return made.value, made.grad, made.hessian.as_matrix()
+
+    return g
+
+
 def primitives(fun: Callable, *args) -> list[str]:
     """The names of all primitives in the jaxpr of `fun`, nested ones included."""
     return [eqn.primitive.name for eqn in _equations(jax.make_jaxpr(fun)(*args).jaxpr)]

@@ -1,10 +1,17 @@
 """What every test runs under: strict dtypes and ranks, warnings as errors, x64 off by default."""
 
+import os
+
+# a small solve that waits for threads of LAPACK on busy cores takes a hundred times as long
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import jax
 import pytest
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+# most of a test is compiling, which takes a quarter to a third less without optimisations
+jax.config.update("jax_disable_most_optimizations", True)
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -230,3 +230,12 @@ def test_sigma_broadcasts_to_its_leaf(key):
     full = [jnp.broadcast_to(sigma, (3, 2)) for sigma in forms]
     found = jax.jit(lambda *forms: [run(sigma) for sigma in forms])(*forms)
     assert_same(found, jax.jit(lambda: [run(sigma) for sigma in full])())
+
+
+def test_counts_may_be_integers_of_numpy(key):
+    x = jnp.array([0.1, 0.2])
+    g = lambda num, size: sd.smooth_grad(boxes, 0.5, num_samples=num, batch_size=size, **PLAIN)
+    np.testing.assert_array_equal(g(np.int64(16), np.int32(8))(key, x), g(16, 8)(key, x))
+    for bad in (np.int64(0), 16.0, np.float64(16), "16", None):
+        with pytest.raises(ValueError, match="num_samples must be a positive integer"):
+            g(bad, None)

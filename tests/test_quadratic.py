@@ -186,3 +186,31 @@ def test_indefinite_and_negative_definite_hessians():
         exact = jax.hessian(smoothed)(jnp.array(x))
         np.testing.assert_array_equal(np.sign(np.linalg.eigvalsh(exact)), signs)
         assert_unbiased(hessians(keys(512), jnp.array(x)), exact, resolution=0.03)
+
+
+def test_value_and_gradient_can_be_differentiated(key):
+    """In the parameters and sigma, as those of `smooth`; the Hessian is a constant to AD."""
+    x, sigma = X["a"], 0.4
+
+    def both(x, sigma):
+        make = sd.smooth_quadratic(boxes, sigma, **PLAIN, num_samples=16)
+        model = make(key, x)
+        return model.value, model.grad, model.hessian.mv(x)
+
+    def want(x, sigma):
+        g = lambda x: sd.smooth(boxes, sigma, **PLAIN, num_samples=16)(key, x)
+        return g(x), jax.grad(g)(x)
+
+    derivatives = lambda fun: jax.jit(jax.jacfwd(fun, argnums=(0, 1)))(x, sigma)
+    value, grad, _ = derivatives(both)
+    assert_same((value, grad), derivatives(want))
+    frozen = jax.jit(jax.jacfwd(lambda s: both(jax.lax.stop_gradient(x), s)[2]))(sigma)
+    np.testing.assert_array_equal(frozen, 0)
+
+
+@pytest.mark.parametrize("v", [1.0, jnp.ones(3), jnp.ones((1, 2)), X], ids=str)
+def test_vectors_are_not_broadcast(v, key):
+    operator = sd.smooth_quadratic(boxes, 0.5, **PLAIN, num_samples=8)(key, X["a"]).hessian
+    for product in (operator.mv, operator.stderr):
+        with pytest.raises(ValueError, match=r"v must have the structure and shapes.*\(2,\)"):
+            product(v)
