@@ -87,7 +87,8 @@ def oscillator(jumps: int = 3, num_samples: int = 256) -> Iterator[Check]:
         return jnp.stack([time, (time < deadline).astype(time.dtype)])
 
     g = sd.smooth_jacobian(fun, SIGMA, num_samples=num_samples)
-    found = jax.jit(g)(jax.random.key(0), jnp.array([MU, START], jnp.float32)) * SIGMA
+    found = jax.jit(g)(jax.random.key(0), jnp.array([MU, START], jnp.float32))
+    found = np.asarray(found, np.float64) * SIGMA
     reference, step = smoothed(jumps, deadline), 0.01
     exact = [(reference(step * e) - reference(-step * e)) / (2 * step) for e in np.eye(2)]
     for i, what in enumerate(("time of the jump", "whether it is in time")):
