@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks import methods, tasks
+from benchmarks._task import Task
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -66,10 +67,28 @@ def _list() -> None:
 
 
 def _run(name: str, options: argparse.Namespace, folder: Path, command: str) -> None:
+    from benchmarks import _family, _report
+
+    module = tasks.module(name)
+    built = module.build(options.full)
+    console = Console()
+    if isinstance(built, list):
+        members = [_run_task(task, options, folder / task.name, command) for task in built]
+        results = _family.summarise(module.TITLE, members)
+        _family.draw(results, folder / "evaluations.png")
+        shown = _family.tables(results)
+    else:
+        results = _run_task(built, options, folder, command)
+        shown = _report.tables(results)
+    (folder / "results.json").write_text(json.dumps(results, indent=1) + "\n")
+    console.print(shown)
+    console.print(f"Written to {folder}")
+
+
+def _run_task(task: Task, options: argparse.Namespace, folder: Path, command: str) -> dict:
     from benchmarks import _report, _summary
     from benchmarks._harness import run
 
-    task = tasks.module(name).build(options.full)
     setting = "full" if options.full else "quick"
     chosen = options.methods.split(",") if options.methods else methods.METHODS
     found = run(
@@ -80,13 +99,10 @@ def _run(name: str, options: argparse.Namespace, folder: Path, command: str) -> 
         setting=setting,
         fresh=options.fresh,
     )
-    results = _summary.summarise(task, found, setting, command)
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "results.json").write_text(json.dumps(results, indent=1) + "\n")
+    results = _summary.summarise(task, found, setting, command)
     _report.write(task, results, folder)
-    console = Console()
-    console.print(_report.tables(results))
-    console.print(f"Written to {folder}")
+    return results
 
 
 if __name__ == "__main__":

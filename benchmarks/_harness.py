@@ -5,12 +5,13 @@ benchmark goes on where it was.
 """
 
 import dataclasses
+import functools
 import hashlib
 import itertools
 import json
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from tqdm import tqdm
 
-from benchmarks._task import Budget, Loss, Method, NativeAD, NotAble, Solve, Task, Y
+from benchmarks._task import Budget, Loss, Method, NativeAD, NotAble, Solve, Task, Y, precision_of
 
 GROWTH = 1.1  # a trace keeps a point when the evaluations have grown by this factor
 WARM_UP_SEED = 1_000_003  # a start that is not in any ensemble
@@ -42,13 +43,14 @@ class Counter:
     def __init__(self):
         self.evaluations = 0
 
-    def watch(self, loss: Loss) -> Loss:
-        """The same function of y, counted."""
+    def watch(self, fun: Callable[[Y], jax.Array]) -> Callable[[Y], jax.Array]:
+        """The same function of y, counted: one for each y, whatever the size of the value."""
 
         def counted(y: Y) -> jax.Array:
-            value = loss(y)
-            out = jax.ShapeDtypeStruct((), value.dtype)
-            return jax.pure_callback(self._let_pass, out, value, vmap_method="expand_dims")
+            value = fun(y)
+            out = jax.ShapeDtypeStruct(value.shape, value.dtype)
+            let_pass = functools.partial(self._let_pass, size=value.size)
+            return jax.pure_callback(let_pass, out, value, vmap_method="expand_dims")
 
         return counted
 
@@ -61,9 +63,9 @@ class Counter:
 
         return counted
 
-    def _let_pass(self, value):
+    def _let_pass(self, value, size: int):
         value = np.asarray(value)
-        self.evaluations += value.size
+        self.evaluations += value.size // size
         return value
 
 
@@ -128,14 +130,8 @@ def run(
         The runs of each method, or why it is not able.
     """
     counter = Counter()
-    watched = dataclasses.replace(task, loss=counter.watch(task.loss))
-    if task.native_ad is not None:
-        native_ad = task.native_ad
-        watched = dataclasses.replace(
-            watched, native_ad=lambda: counter.watch_native_ad(native_ad())
-        )
+    watched = _watched(task, counter)
     exact_loss = jax.jit(task.exact_loss)
-    behaviour = _behaviour(task)
     prepared: dict[Method, tuple[Solve, float]] = {}
 
     def obtain(method: Method, seed: int) -> Run:
@@ -153,7 +149,11 @@ def run(
 
     runs: dict[Method, list[Run]] = {method: [] for method in methods}
     not_able: dict[Method, NotAble] = {}
-    with tqdm(total=len(methods) * seeds, disable=not progress, unit="run") as bar:
+    with (
+        precision_of(task),
+        tqdm(total=len(methods) * seeds, disable=not progress, unit="run") as bar,
+    ):
+        behaviour = _behaviour(task)
         for seed, method in itertools.product(range(seeds), methods):
             bar.set_description(f"{task.name}: start {seed}, {method.name}")
             if method not in not_able:
@@ -163,6 +163,16 @@ def run(
                     not_able[method] = reason
             bar.update()
     return runs | not_able
+
+
+def _watched(task: Task, counter: Counter) -> Task:
+    """The task as the methods see it: whatever evaluates it is counted."""
+    watched: dict[str, Any] = {"loss": counter.watch(task.loss)}
+    if task.residuals is not None:
+        watched["residuals"] = counter.watch(task.residuals)
+    if (native_ad := task.native_ad) is not None:
+        watched["native_ad"] = lambda: counter.watch_native_ad(native_ad())
+    return dataclasses.replace(task, **watched)
 
 
 def _warm_up(task: Task, method: Method, counter: Counter) -> tuple[Solve, float]:
@@ -175,6 +185,8 @@ def _warm_up(task: Task, method: Method, counter: Counter) -> tuple[Solve, float
 
 def _record(task: Task, solve: Solve, seed: int, counter: Counter, iterations: float = np.inf):
     """The trace of a run, and why it ended."""
+    if task.choose is not None:
+        task.choose(seed)
     y0 = task.start(seed)
     recorder = Recorder(counter, task.budget, y0, iterations)
     ended = "by the method"
@@ -186,19 +198,21 @@ def _record(task: Task, solve: Solve, seed: int, counter: Counter, iterations: f
 
 
 def _solve(task: Task, solve: Solve, seed: int, counter: Counter, exact_loss: Loss) -> Run:
-    """One run with its scores. Errors are relative to those of the start."""
+    """One run with its scores. Errors are relative to those of the start, except for the gap."""
     trace, ended = _record(task, solve, seed, counter)
     _, unravel = ravel_pytree(task.reference)
     evaluations, seconds, ys = zip(*trace, strict=True)
-    image = np.array([float(exact_loss(unravel(y))) for y in ys])
-    distance = np.array([task.distance(unravel(y)) for y in ys])
+    gap = np.array([float(exact_loss(unravel(y))) for y in ys]) - (task.optimum or 0.0)
+    sought = _flat(task.reference if task.choose is None else task.choose(seed))
+    distance = np.linalg.norm(np.asarray(ys, float) - sought.astype(float), axis=1)
     return {
         "seed": seed,
         "ended": ended,
         "evaluations": list(evaluations),
         "seconds": list(seconds),
-        "image_error": (image / image[0]).tolist(),
+        "image_error": (gap / gap[0]).tolist(),
         "parameter_error": (distance / distance[0]).tolist(),
+        **({} if task.optimum is None else {"gap": gap.tolist()}),
         "distance": float(distance[-1]),
         "found": ys[-1].tolist(),
     }
@@ -210,6 +224,8 @@ def _flat(y: Y) -> np.ndarray:
 
 def _behaviour(task: Task) -> str:
     """Changes when the task does: its settings, and what its black box says at two points."""
+    if task.choose is not None:
+        task.choose(0)
     points = task.start(0), task.reference
     losses = [float(task.loss(y)) for y in points]
     bounds = [_flat(y).tolist() for y in (*points, *task.bounds)]

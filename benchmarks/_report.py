@@ -10,21 +10,23 @@ from rich import box
 from rich.console import Group
 from rich.table import Table
 
-from benchmarks._style import figure, looks
-from benchmarks._summary import COSTS, ERRORS, LEVELS, band
+from benchmarks._style import figure, legend, looks
+from benchmarks._summary import COSTS, LEVELS, band
 from benchmarks._task import Task
 
-FLOOR = 1e-7  # the smallest relative error that is drawn
+FLOORS = {"image_error": 1e-7, "parameter_error": 1e-7, "gap": 1e-10}  # the smallest error drawn
 PICTURED = 3  # starts in images.png
 LABELS = {
-    "image_error": "Image error, relative to the start",
+    "image_error": "Image error (loss), relative to the start",
     "parameter_error": "Parameter error, relative to the start",
+    "gap": "Loss above its lowest value",
     "evaluations": "Evaluations",
     "seconds": "Seconds",
 }
 CAPTIONS = {
     "image_error": "On renders without noise, which are not charged.",
     "parameter_error": "Seconds are without compilation.",
+    "gap": "It is absolute.",
 }
 
 
@@ -43,27 +45,35 @@ def able(results: dict[str, Any]) -> dict[str, Any]:
     return {name: found for name, found in results["methods"].items() if "runs" in found}
 
 
+def errors_of(results: dict[str, Any]) -> list[str]:
+    """The errors by which the methods were scored."""
+    methods = able(results).values()
+    return [error for error in LEVELS if any(error in found for found in methods)]
+
+
 def _curves(results: dict[str, Any], cost: str, path: Path) -> None:
-    """Median and quartiles over the starts: image error left, parameter error right."""
-    methods, look = able(results), looks(results["methods"])
-    with figure(path, 1, 2, (9, 3.8)) as (drawn, axes):
-        for axis, error in zip(axes[0], ERRORS, strict=True):
-            lowest, highest = LEVELS["90"], 1.0
+    """Median and quartiles over the starts, a panel for each error."""
+    methods, look, errors = able(results), looks(results["methods"]), errors_of(results)
+    with figure(path, 1, len(errors), (4.5 * len(errors), 3.8)) as (drawn, axes):
+        for axis, error in zip(axes[0], errors, strict=True):
+            lowest, highest = 0.1, 1.0
             for name, found in methods.items():
                 runs = found["runs"]
                 costs = np.concatenate([run[cost] for run in runs])
-                grid = np.geomspace(min(run[cost][1] for run in runs), costs.max(), 200)
-                low, middle, high = np.maximum(band(runs, error, cost, grid), FLOOR)
+                if not costs.any():  # it gave up at once
+                    continue
+                grid = np.geomspace(costs[costs > 0].min(), costs.max(), 200)
+                low, middle, high = np.maximum(band(runs, error, cost, grid), FLOORS[error])
                 axis.plot(grid, middle, label=found["title"], **look[name])
                 axis.fill_between(grid, low, high, color=look[name]["color"], alpha=0.15, lw=0)
                 lowest, highest = min(lowest, low.min()), max(highest, high.max())
             axis.set(ylim=(lowest / 1.3, highest * 1.3))
             axis.set(xscale="log", yscale="log", xlabel=LABELS[cost], title=LABELS[error])
-            for level in (level for level in LEVELS.values() if level >= lowest):
+            for level in (level for level in LEVELS[error].values() if level >= lowest):
                 axis.axhline(level, color="0.6", lw=0.6, ls=":", zorder=0)
         starts = max(found["starts"] for found in methods.values())
         handles, labels = axes[0, 0].get_legend_handles_labels()
-        drawn.legend(handles, labels, loc="outside lower center", ncols=min(4, len(labels)))
+        legend(drawn, handles, labels)
         drawn.suptitle(
             f"{results['title']} ({results['setting']}): median and quartiles over {starts} starts",
             x=0.01,
@@ -109,30 +119,29 @@ def tables(results: dict[str, Any]) -> Group:
         for name, found in methods.items()
         if name not in able(results)
     ]
-    took = [_took(results, error) for error in ERRORS]
+    took = [_took(results, error) for error in errors_of(results)]
     return Group(*took, _left(results), *not_able)
 
 
 def _took(results: dict[str, Any], error: str) -> Table:
-    kind = error.replace("_", " ")
+    kind, unit = error.replace("_", " "), "" if error == "gap" else " %"
     shown = Table(
         title=f"{results['title']} ({results['setting']}): reducing the {kind}",
         caption=f"Median \\[quartiles] over the starts; - is not reached. {CAPTIONS[error]}",
         box=box.SIMPLE_HEAD,
     )
     shown.add_column("method")
-    for column in ("reduction", "solved", *COSTS):
+    for column in ("to" if error == "gap" else "reduction", "solved", *COSTS):
         shown.add_column(column, justify="right", no_wrap=True)
     for found in able(results).values():
-        for level, reached in found[error]["levels"].items():
-            first, last = level == "90", level == "99.9"
+        for i, (level, reached) in enumerate(found[error]["levels"].items()):
             shown.add_row(
-                found["title"] if first else "",
-                f"{level} %",
+                "" if i else found["title"],
+                level + unit,
                 f"{reached['solved']}/{found['starts']}",
                 *(_show(reached[cost]) for cost in COSTS),
-                end_section=last,
             )
+        shown.add_section()
     return shown
 
 
@@ -147,7 +156,7 @@ def _left(results: dict[str, Any]) -> Table:
     for column in ("image error", "parameter error", "distance", "compile"):
         shown.add_column(column, justify="right")
     for found in able(results).values():
-        errors = [_show(found[error]["final"]) for error in ERRORS]
+        errors = [_show(found[error]["final"]) for error in ("image_error", "parameter_error")]
         compiling = f"{found['warm_up_seconds']:.1f} s"
         shown.add_row(found["title"], *errors, _show(found["distance"]), compiling)
     return shown

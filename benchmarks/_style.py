@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 # Okabe and Ito 2008, without yellow, which is too pale for a line
 COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 DASHES = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1, 1, 1, 1, 1)))
+CROWDED = 8  # methods, beyond which a legend needs a side of its own
 STYLE: dict[Any, Any] = {
     "font.size": 9,
     "axes.titlesize": 10,
@@ -43,6 +44,16 @@ def figure(path: Path, rows: int, columns: int, size: tuple[float, float]) -> It
         path.parent.mkdir(parents=True, exist_ok=True)
         drawn.savefig(path)
         plt.close(drawn)
+
+
+def legend(drawn: Figure, handles: list, labels: list[str]) -> None:
+    """Names the methods: below the axes or, where they are many, on the right of a wider figure."""
+    if len(labels) > CROWDED:
+        width, height = drawn.get_size_inches()
+        drawn.set_size_inches(width + 3.5, max(height, 0.2 * len(labels) + 0.6))
+        drawn.legend(handles, labels, loc="outside right center", handlelength=3.5)
+    else:
+        drawn.legend(handles, labels, loc="outside lower center", ncols=min(4, len(labels)))
 
 
 def looks(names) -> dict[str, dict]:

@@ -1,7 +1,8 @@
 """From runs to numbers: medians and quartiles over the starts, of errors and of what they took.
 
 Errors are relative to those of the start. A level of 99 % is reached at the first point of a run
-whose error is at most 1 % of the start's. A run that never gets there took infinitely long, so a
+whose error is at most 1 % of the start's. Where the lowest value of the loss is known, there is
+also the gap to it, which is absolute. A run that never gets to a level took infinitely long, so a
 median is infinite when half of the runs do not get there.
 """
 
@@ -12,15 +13,20 @@ from collections.abc import Sequence
 from importlib import metadata
 from typing import Any
 
+import jax
 import numpy as np
 
 from benchmarks._harness import Run
 from benchmarks._task import Method, NotAble, Task
 
-LEVELS = {"90": 0.1, "99": 0.01, "99.9": 0.001}
-ERRORS = ("image_error", "parameter_error")
+REDUCTIONS = {"90": 0.1, "99": 0.01, "99.9": 0.001}  # in percent
+GAPS = {"1e0": 1.0, "1e-3": 1e-3, "1e-8": 1e-8}
+LEVELS = {"image_error": REDUCTIONS, "parameter_error": REDUCTIONS, "gap": GAPS}
 COSTS = ("evaluations", "seconds")
-PACKAGES = ("smoothdiff", "jax", "jaxlib", "optax", "optimistix", "numpy", "mitsuba", "cma")
+PACKAGES = (
+    *("smoothdiff", "jax", "jaxlib", "optax", "optimistix", "equinox", "lineax", "numpy", "scipy"),
+    *("mitsuba", "coco-experiment", "cma", "evosax", "jaxopt", "Py-BOBYQA"),
+)
 
 
 def summarise(
@@ -34,6 +40,7 @@ def summarise(
         "notes": task.notes,
         "budget": task.budget._asdict(),
         "sigma": task.sigma,
+        "dimensions": sum(np.size(leaf) for leaf in jax.tree.leaves(task.reference)),
         "command": command,
         "machine": machine(),
         "methods": {
@@ -52,9 +59,12 @@ def _of_method(runs: list[Run]) -> dict[str, Any]:
         **{
             error: {
                 "final": _quartiles([run[error][-1] for run in runs]),
-                "levels": {name: _level(runs, error, level) for name, level in LEVELS.items()},
+                "levels": {
+                    name: _level(runs, error, level) for name, level in LEVELS[error].items()
+                },
             }
-            for error in ERRORS
+            for error in LEVELS
+            if error in runs[0]
         },
         "runs": [{k: v for k, v in run.items() if k != "fingerprint"} for run in runs],
     }

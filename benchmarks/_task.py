@@ -4,12 +4,12 @@ A method sees a task, prepares itself for it once, and is then run from several 
 harness where it is after each iteration and is stopped by it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import jax
-import numpy as np
 
 Y: TypeAlias = Any  # the parameters: an array or a pytree of arrays
 Key: TypeAlias = jax.Array
@@ -51,6 +51,13 @@ class Task:
         image: A picture of y without noise, y -> (H, W, 3) linear RGB, or None. Not counted.
         native_ad: Gives y -> (loss, gradient) by the renderer's own AD, or None. It raises NotAble
             where that cannot run.
+        residuals: y -> array, such that the loss is the sum or the mean of its squares, or None: a
+            picture minus its reference, say. A call is counted like a call of the loss.
+        precision: What the task is run in; all of its functions are called in it.
+        optimum: The lowest value of the loss, or None. With it, runs are also scored by how far
+            above it they are.
+        choose: Makes the black box that of a seed, and returns the y that is sought then; or None
+            where it is the same for all seeds.
         notes: Facts that belong beside the results, resolution and variant, say.
     """
 
@@ -66,16 +73,26 @@ class Task:
     seeds: int
     image: Callable[[Y], jax.Array] | None = None
     native_ad: Callable[[], NativeAD] | None = None
+    residuals: Callable[[Y], jax.Array] | None = None
+    precision: Literal["float32", "float64"] = "float32"
+    optimum: float | None = None
+    choose: Callable[[int], Y] | None = None
     notes: str = ""
 
-    def distance(self, y: Y) -> float:
-        """The Euclidean distance of y from the reference."""
-        squares = jax.tree.map(
-            lambda a, b: np.sum((np.asarray(a, float) - np.asarray(b, float)) ** 2),
-            y,
-            self.reference,
-        )
-        return float(np.sqrt(sum(jax.tree.leaves(squares))))
+
+@contextmanager
+def precision_of(task: Task) -> Iterator[None]:
+    """Inside, JAX has the precision of the task.
+
+    For the whole process: `with jax.enable_x64(True)` is for one thread, and callbacks run in
+    threads of JAX's, where float64 would become float32.
+    """
+    before = jax.config.read("jax_enable_x64")
+    jax.config.update("jax_enable_x64", task.precision == "float64")
+    try:
+        yield
+    finally:
+        jax.config.update("jax_enable_x64", before)
 
 
 class Method(NamedTuple):

@@ -9,12 +9,14 @@ from smoothdiff._gp import GaussianProcess
 from smoothdiff._host_calls import BlackBoxError
 from smoothdiff._importance import Importance, difference_hvp
 from smoothdiff._least_squares import LeastSquares
-from smoothdiff._minimise import MinimiseError, Record, Result, minimise
+from smoothdiff._minimise import MinimiseError, Record, Result, least_squares, minimise
 from smoothdiff._quadratic import HessianOperator, QuadraticModel
 from smoothdiff._samplers import AbstractSampler, Gaussian, Noise, Orthogonal, Sobol, Uniform
 from smoothdiff._smooth import smooth, smooth_grad, smooth_jacobian, smooth_value_and_grad
 from smoothdiff._smooth_second import smooth_hessian, smooth_hvp, smooth_quadratic
 from smoothdiff._solvers.first_order import FirstOrder
+from smoothdiff._solvers.gauss_newton import GaussNewton
+from smoothdiff._solvers.newton_cg import NewtonCG
 from smoothdiff._support import local_support, matrix_support, probe_support
 
 __version__ = "0.1.0"
@@ -25,12 +27,14 @@ __all__ = [
     "Aggregate",
     "BlackBoxError",
     "FirstOrder",
+    "GaussNewton",
     "Gaussian",
     "GaussianProcess",
     "HessianOperator",
     "Importance",
     "LeastSquares",
     "MinimiseError",
+    "NewtonCG",
     "Noise",
     "Options",
     "Orthogonal",
@@ -42,6 +46,7 @@ __all__ = [
     "black_box",
     "difference_hvp",
     "kernels",
+    "least_squares",
     "local_support",
     "matrix_support",
     "minimise",

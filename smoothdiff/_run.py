@@ -90,21 +90,20 @@ class Problem(eqx.Module):
     args: PyTree
     options: dict[str, Any]
 
-    def _fn(self, y: PyTree, args: PyTree) -> tuple[Array, None]:
-        return jnp.asarray(self.fun(y, args)), None
+    def _fn(self, y: PyTree, args: PyTree) -> tuple[PyTree[Array], None]:
+        return jax.tree.map(jnp.asarray, self.fun(y, args)), None
 
     @eqx.filter_jit
-    def value(self, y: PyTree) -> Array:
+    def value(self, y: PyTree) -> PyTree[Array]:
         return self._fn(y, self.args)[0]
 
-    def init(self, y: PyTree) -> Any:
-        """The first state. Not compiled, so that the solver can look at values and refuse them."""
+    def init(self, y: PyTree, check: Callable[[PyTree], None]) -> Any:
+        """The first state, if `check` accepts the structure of what the function returns.
+
+        Not compiled, so that the solver can look at values and refuse them.
+        """
         out = jax.eval_shape(lambda y: self.value(y), y)
-        if out.shape != () or not jnp.issubdtype(out.dtype, jnp.floating):
-            raise TypeError(
-                f"fun returned shape {out.shape} and dtype {out.dtype}; it must return one real "
-                "floating-point number: use jnp.mean(...) or .astype(float)"
-            )
+        check(out)
         state = self.solver.init(self._fn, y, self.args, self.options, out, None, frozenset())
         # weak types would compile the second step anew
         return jax.tree.map(lambda a: jnp.asarray(a, a.dtype), state)

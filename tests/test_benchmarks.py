@@ -3,8 +3,10 @@
 This module is itself the task and one of the methods that the command line is given.
 """
 
+import dataclasses
 import json
 import math
+import types
 
 import jax
 import jax.numpy as jnp
@@ -98,6 +100,45 @@ def test_counts_every_evaluation_under_jit_vmap_and_scan(bowl):
     assert counter.evaluations == 15
 
 
+def test_residuals_are_counted_once_for_each_y(bowl):
+    task = dataclasses.replace(bowl, residuals=lambda y: y["b"])
+    counter = _harness.Counter()
+    residuals = _harness._watched(task, counter).residuals
+    assert residuals is not None
+    y = bowl.start(0)
+    assert np.array_equal(jax.jit(residuals)(y), y["b"])
+    assert counter.evaluations == 1
+    many = jax.tree.map(lambda leaf: jnp.stack([leaf] * 7), y)
+    jax.jit(jax.vmap(residuals))(many).block_until_ready()
+    assert counter.evaluations == 8
+
+
+def test_a_known_optimum_is_scored_by_the_gap_in_the_precision_of_the_task(tmp_path):
+    seeds = []
+    with jax.enable_x64(True):
+        bowl = build(full=False)
+
+    def loss(y):
+        assert y["a"].dtype == "float64"
+        return bowl.loss(y) - 3
+
+    def choose(seed):
+        seeds.append(seed)
+        return jax.tree.map(lambda leaf: leaf + seed, bowl.reference)
+
+    task = dataclasses.replace(
+        bowl, loss=loss, exact_loss=loss, precision="float64", optimum=-3.0, choose=choose
+    )
+    first, second = harness(task, HALVING, tmp_path)
+    for run in (first, second):
+        assert run["gap"] == pytest.approx([run["gap"][0] * 0.25**i for i in range(11)])
+        assert run["image_error"] == pytest.approx([0.25**i for i in range(11)])
+    assert first["distance"] < 0.01
+    assert second["distance"] == pytest.approx(3**0.5, rel=0.01)
+    assert seeds == [0, _harness.WARM_UP_SEED, 0, 0, 1, 1]
+    assert jnp.zeros(()).dtype == "float32"
+
+
 def test_traces_are_relative_to_the_start_and_counted(bowl, tmp_path):
     for seed, run in enumerate(harness(bowl, HALVING, tmp_path)):
         assert run["seed"] == seed
@@ -109,8 +150,8 @@ def test_traces_are_relative_to_the_start_and_counted(bowl, tmp_path):
 
 
 def test_the_budget_ends_a_run(bowl, tmp_path):
-    object.__setattr__(bowl, "budget", Budget(evaluations=12, seconds=60))
-    for run in harness(bowl, HALVING, tmp_path):
+    short = dataclasses.replace(bowl, budget=Budget(evaluations=12, seconds=60))
+    for run in harness(short, HALVING, tmp_path):
         assert run["evaluations"] == [0, 5, 10, 15]
         assert run["ended"] == "by the budget"
 
@@ -145,8 +186,8 @@ def test_a_method_that_is_not_able_is_named_not_raised(bowl, tmp_path):
 
 
 def test_a_gradient_of_the_renderer_costs_two(bowl, tmp_path):
-    object.__setattr__(bowl, "native_ad", lambda: jax.value_and_grad(bowl.loss))
-    (run, _) = harness(bowl, methods.load("mitsuba_ad"), tmp_path)
+    task = dataclasses.replace(bowl, native_ad=lambda: jax.value_and_grad(bowl.loss))
+    (run, _) = harness(task, methods.load("mitsuba_ad"), tmp_path)
     assert run["evaluations"][1] == 2
     assert run["image_error"][-1] < 1e-2
 
@@ -192,6 +233,29 @@ def test_the_command_line_writes_results_pictures_and_table(monkeypatch, tmp_pat
     assert levels["parameter_error"]["levels"]["99"]["solved"] == 2
     for picture in ("error-vs-time.png", "error-vs-evaluations.png", "images.png"):
         assert (folder / picture).read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_family_shares_a_table_and_a_picture(monkeypatch, tmp_path, capsys):
+    def members(full):
+        return [dataclasses.replace(build(full), name=f"bowl-{n}d", optimum=0.0) for n in (2, 5)]
+
+    family = types.SimpleNamespace(TITLE="Bowls", build=members)
+    monkeypatch.setattr(tasks, "module", lambda name: family)
+    monkeypatch.setitem(tasks.TASKS, "bowls", "")
+    monkeypatch.setitem(methods.METHODS, "halving", __name__)
+    monkeypatch.setenv("COLUMNS", "150")
+    cli.main(["run", "bowls", "--methods", "halving,mitsuba_ad"], tmp_path)
+    printed = capsys.readouterr().out
+    assert "bowl-5d" in printed
+    assert "- (0/2)" in printed  # to 1e-8
+
+    results = json.loads((tmp_path / "bowls" / "results.json").read_text())
+    found = results["tasks"]["bowl-2d"]["methods"]
+    assert "not_able" in found["mitsuba_ad"]
+    assert "runs" not in found["halving"]
+    assert found["halving"]["gap"]["levels"]["1e-3"]["solved"] == 2
+    for picture in ("evaluations.png", "bowl-2d/error-vs-time.png"):
+        assert (tmp_path / "bowls" / picture).read_bytes().startswith(b"\x89PNG")
 
 
 def test_the_command_line_names_what_there_is(capsys):

@@ -1,11 +1,13 @@
 """The methods. Each is a module with TITLE and `prepare(task) -> solve`, imported when asked for.
 
-To add one, write the module and name it here; the order is that of tables and figures. A method has
-one setting for all tasks: it takes its scale from `task.sigma`, and from nothing else.
+A module of several methods has VARIANTS instead, name -> (title, prepare). To add a method, write
+it and name it here; the order is that of tables and figures. A method has one setting for all
+tasks: it takes its scale from `task.sigma` and the bounds, and from nothing else.
 """
 
 import importlib
 import inspect
+import re
 from pathlib import Path
 
 from benchmarks._task import Method
@@ -15,6 +17,25 @@ METHODS = {
     "fr22": "benchmarks.methods.fr22",
     "cma_es": "benchmarks.methods.cma_es",
     "mitsuba_ad": "benchmarks.methods.mitsuba_ad",
+    "evosax_snes": "benchmarks.methods.evosax_snes",
+    "nelder_mead": "benchmarks.methods.scipy_local",
+    "powell": "benchmarks.methods.scipy_local",
+    "py_bobyqa": "benchmarks.methods.py_bobyqa",
+    "optimistix_bfgs": "benchmarks.methods.optimistix_bfgs",
+    "jaxopt_lbfgs": "benchmarks.methods.jaxopt_lbfgs",
+    "our_gradient": "benchmarks.methods.our_gradient",
+    "our_h": "benchmarks.methods.nonlinear_cg",
+    "our_hvp": "benchmarks.methods.nonlinear_cg",
+    "our_hvpa": "benchmarks.methods.nonlinear_cg",
+    "newton": "benchmarks.methods.newton",
+    "newton_modified": "benchmarks.methods.newton",
+    "bfgs": "benchmarks.methods.quasi_newton",
+    "lbfgs": "benchmarks.methods.quasi_newton",
+    "bfgs_wolfe": "benchmarks.methods.quasi_newton",
+    "bfgs_damped": "benchmarks.methods.quasi_newton",
+    "bfgs_adaptive": "benchmarks.methods.adaptive_differences",
+    "newton_cg": "benchmarks.methods.newton_cg",
+    "gauss_newton": "benchmarks.methods.gauss_newton",
 }
 
 
@@ -23,6 +44,21 @@ def load(name: str) -> Method:
     if name not in METHODS:
         raise ValueError(f"There is no method {name!r}; choose from {', '.join(METHODS)}.")
     module = importlib.import_module(METHODS[name])
-    shared = sorted(Path(__file__).parent.glob("_*.py"))
-    source = inspect.getsource(module) + "".join(path.read_text() for path in shared)
-    return Method(name, module.TITLE, module.prepare, source)
+    if hasattr(module, "VARIANTS"):
+        title, prepare = module.VARIANTS[name]
+    else:
+        title, prepare = module.TITLE, module.prepare
+    return Method(name, title, prepare, _source(inspect.getsource(module)))
+
+
+def _source(text: str) -> str:
+    """The text of a module, followed by the text of the modules here that it imports, in turn."""
+    found = {"": text}
+    waiting = [text]
+    while waiting:
+        for name in re.findall(r"from benchmarks\.methods(?:\.| import )(\w+)", waiting.pop()):
+            path = Path(__file__).with_name(f"{name}.py")
+            if name not in found and path.exists():
+                found[name] = path.read_text()
+                waiting.append(found[name])
+    return "".join(text for _, text in sorted(found.items()))

@@ -1,34 +1,46 @@
-"""CMA-ES as in pycma, with its own defaults; sigma0 and the bounds come from the task."""
+"""CMA-ES as in pycma, with its own defaults; sigma0 and the bounds come from the task.
+
+When it stops it starts again from a random point with twice the population, as `cma.fmin2` does
+with `restarts` (IPOP). A restart is shown once it has seen something better than all before it.
+"""
+
+import itertools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 
 from benchmarks._task import Solve, Task
+from benchmarks.methods._flat import Flat, package
 
-TITLE = "CMA-ES (pycma)"
+TITLE = "CMA-ES with restarts (pycma)"
 
 
 def prepare(task: Task) -> Solve:
     """Evaluates a whole population in one call."""
-    import cma
-
-    reference, unravel = ravel_pytree(task.reference)
-    losses = jax.jit(jax.vmap(lambda flat: task.loss(unravel(flat))))
-    low, high = (np.asarray(ravel_pytree(bound)[0], float) for bound in task.bounds)
+    cma = package("cma", "cma")
+    flat = Flat(task)
+    low, high = np.asarray(flat.low, float), np.asarray(flat.high, float)
 
     def solve(y0, key, record):
-        options = {
-            "bounds": [low, high],
-            "seed": int(jax.random.randint(key, (), 1, 2**31 - 1)),
-            "verbose": -9,
-        }
-        start = np.asarray(ravel_pytree(y0)[0], float)
-        search = cma.CMAEvolutionStrategy(start, task.sigma, options)
-        while not search.stop():
-            points = search.ask()
-            search.tell(points, np.asarray(losses(np.asarray(points, reference.dtype))).tolist())
-            record(unravel(jnp.asarray(search.result.xfavorite, reference.dtype)))
+        random = np.random.default_rng(int(jax.random.randint(key, (), 1, 2**31 - 1)))
+        population = 4 + int(3 * np.log(flat.size))  # pycma's own
+        start, lowest, shown = flat.start(y0), np.inf, y0
+        for restart in itertools.count():
+            options = {
+                "bounds": [low, high],
+                "seed": int(random.integers(1, 2**31)),
+                "popsize": population * 2**restart,
+                "verbose": -9,
+            }
+            search = cma.CMAEvolutionStrategy(start, task.sigma, options)
+            while not search.stop():
+                points = search.ask()
+                values = flat.values(np.asarray(points, flat.dtype))
+                search.tell(points, np.asarray(values, float).tolist())
+                if search.best.f < lowest:
+                    shown = flat.tree(search.result.xfavorite)
+                record(shown)
+            lowest = min(lowest, search.best.f)
+            start = random.uniform(low, high)
 
     return solve

@@ -8,6 +8,7 @@ import optax
 import smoothdiff as sd
 from benchmarks._task import Solve, Task
 from benchmarks.methods._adam import optimiser
+from benchmarks.methods._host_loop import run_by
 
 TITLE = "Smoothed gradient, Adam (FR22)"
 NUM_SAMPLES = 2
@@ -24,22 +25,4 @@ def prepare(task: Task) -> Solve:
         sampler=sd.Gaussian(antithetic=True),
         baseline="none",
     )
-
-    def fun(y, args):
-        return task.loss(y)
-
-    def solve(y0, key, record):
-        result = sd.minimise(
-            fun,
-            y0,
-            key=key,
-            solver=solver,
-            max_evaluations=task.budget.evaluations,
-            bounds=task.bounds,
-            callback=lambda step: record(step.y),
-        )
-        if result.reason == "interrupted":
-            raise KeyboardInterrupt
-        record(result.y)
-
-    return solve
+    return run_by(sd.minimise, task, task.loss, solver)

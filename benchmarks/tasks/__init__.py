@@ -1,6 +1,7 @@
-"""The tasks. Each is a module with TITLE and `build(full) -> Task`, imported when it is asked for.
+"""The tasks. Each is a module with TITLE and `build(full)`, imported when it is asked for.
 
-To add one, write the module and name it here.
+`build` gives a Task, or a list of them where one name stands for a family, such as a function in
+several dimensions; they are named "function-5d". To add one, write the module and name it here.
 """
 
 import importlib
@@ -8,6 +9,16 @@ from types import ModuleType
 
 TASKS = {
     "shadow": "benchmarks.tasks.shadow",
+    "quad": "benchmarks.tasks.quad",
+    "box2": "benchmarks.tasks.box2",
+    "box10": "benchmarks.tasks.box10",
+    "box10-occluding": "benchmarks.tasks.box10_occluding",
+    "rocket": "benchmarks.tasks.rocket",
+    "brdf": "benchmarks.tasks.brdf",
+    "rosenbrock": "benchmarks.tasks.rosenbrock",
+    "negated-gaussian": "benchmarks.tasks.negated_gaussian",
+    "ellipsoid": "benchmarks.tasks.ellipsoid",
+    "bbob": "benchmarks.tasks.bbob",
 }
 
 

@@ -21,5 +21,7 @@ iterates, one step at a time under `smoothdiff.minimise`. What both rely on:
 
 from smoothdiff._solvers._base import AbstractSmoothSolver, Progress
 from smoothdiff._solvers.first_order import FirstOrder
+from smoothdiff._solvers.gauss_newton import GaussNewton
+from smoothdiff._solvers.newton_cg import NewtonCG
 
-__all__ = ["AbstractSmoothSolver", "FirstOrder", "Progress"]
+__all__ = ["AbstractSmoothSolver", "FirstOrder", "GaussNewton", "NewtonCG", "Progress"]

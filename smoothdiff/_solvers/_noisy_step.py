@@ -1,0 +1,168 @@
+"""A Newton step under noise: how far to go, and what to make of the outcome."""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from smoothdiff._solvers._metric import Metric
+from smoothdiff._solvers._scalar_fit import ScalarFit
+from smoothdiff._solvers._trust_region import truncated_cg
+
+# a step is taken if the function falls by this share of what the model promised
+_ACCEPT = 0.05
+# a gradient as many times its standard error allows a step over the whole trust region; with less
+# the radius falls steeply, so that samples are added up before the next step
+_SURE, _STEEP = 2.0, 6
+# the radius stays between these, in units of the distance of a sample
+_LEAST, _MOST = 0.05, 16.0
+# the model is faithful where it promised as much as came, give or take this share
+_FAITH = 0.5
+# how near to the boundary is at it
+_EDGE = 0.99
+
+
+class Trust(eqx.Module):
+    """How far the model is believed.
+
+    `width` is that of the samples relative to sigma, `radius` that of the trust region in widths,
+    `promised` the decrease that the model expected of the last step. `quiet` counts the steps in a
+    row that led nowhere, and `blind` says that the last gradient was all noise.
+    """
+
+    width: Float[Array, ""]
+    radius: Float[Array, ""]
+    promised: Float[Array, ""]
+    quiet: Int[Array, ""]
+    blind: Bool[Array, ""]
+
+    @staticmethod
+    def start(n: int, dtype) -> "Trust":
+        """As wide as sigma: samples reach as far as the square root of n widths."""
+        one = jnp.ones((), dtype)
+        none = jnp.zeros((), jnp.int32)
+        return Trust(one, math.sqrt(n) * one, 0 * one, none, jnp.asarray(False))
+
+
+class Step(NamedTuple):
+    """A step in units of the width, and what speaks for it.
+
+    `bold` is the length of the step if there were no noise, `spread` the noise of the Newton step
+    along it. At the `edge` the trust region cuts the step short. A `blind` step is zero, since the
+    gradient is all noise, and on a `flat` function there is no gradient at all.
+    """
+
+    p: Float[Array, " n"]
+    promised: Float[Array, ""]
+    bold: Float[Array, ""]
+    spread: Float[Array, ""]
+    edge: Bool[Array, ""]
+    blind: Bool[Array, ""]
+    flat: Bool[Array, ""]
+
+
+def outcome(
+    model: ScalarFit, before: Float[Array, " n"], promised: Float[Array, ""]
+) -> tuple[Bool[Array, ""], Float[Array, ""]]:
+    """Whether the step from `before` to here was good, and the ratio that says so.
+
+    One model judges both ends, on the same samples; the noise of the difference counts in favour.
+
+    Source: Sun and Nocedal 2023, A trust region method for noisy unconstrained optimization.
+    """
+    fell = model.value(before) - model.value(jnp.zeros_like(before))
+    noise = model.difference_stderr(before)
+    # after no step at all there is nothing to regret
+    ratio = jnp.where(promised > 0, (fell + noise) / (promised + noise), 1)
+    return ratio > _ACCEPT, ratio
+
+
+def propose(
+    model: ScalarFit,
+    at: Float[Array, " n"],
+    turn: Metric,
+    radius: Float[Array, ""],
+    confine: Callable[[Array], Array],
+) -> Step:
+    """The step that the model asks for at the place `at`, as far as it is to be believed.
+
+    The step and the radius are in the turned metric. `confine` gives what bounds leave of a step.
+    """
+    bend = model.curvature(at)
+
+    def curvature(p: Array) -> Array:
+        return turn.out(bend(turn.out(p)))
+
+    grad, error = model.grad(at), model.grad_stderr(at)
+    size = jnp.linalg.norm(grad)
+    # noise has no more dimensions than there are samples
+    count = jnp.minimum(grad.size, jnp.sum(model.closeness > 0)).astype(grad.dtype)
+    chance = jnp.sqrt(count) * jnp.linalg.norm(_ratio(grad, size) * error)
+    sure = jnp.minimum(1, _ratio(size, _SURE * chance) ** _STEEP)
+    # positive-part James-Stein: an entry within its noise says nothing
+    believed = turn.out(grad * jnp.maximum(0, 1 - _ratio(error, jnp.abs(grad)) ** 2))
+    most = math.sqrt(grad.size)
+    reach = jnp.minimum(radius * sure, most)
+    p = confine(truncated_cg(curvature, believed, reach))
+    promised = -(jnp.vdot(believed, p) + jnp.vdot(p, curvature(p)) / 2)
+    # bounds can leave of a step what is worse than none
+    p = jnp.where(promised > 0, p, 0)
+    bold = truncated_cg(curvature, turn.out(grad), jnp.minimum(radius, most))
+    bent = jnp.abs(jnp.vdot(bold, curvature(bold)))
+    ahead = turn.out(bold)
+    error_ahead = jnp.linalg.norm(_ratio(ahead, jnp.linalg.norm(ahead)) * error)
+    return Step(
+        p=p,
+        promised=jnp.maximum(promised, 0),
+        bold=jnp.linalg.norm(bold),
+        spread=_ratio(error_ahead * jnp.vdot(bold, bold), bent),
+        edge=jnp.linalg.norm(p) >= _EDGE * reach,
+        blind=~jnp.any(believed != 0),
+        flat=size == 0,
+    )
+
+
+def _ratio(a: Array, b: Array) -> Array:
+    """a / b, and huge rather than NaN where b is zero."""
+    return a / jnp.maximum(b, jnp.finfo(b.dtype).tiny)
+
+
+def revise(
+    trust: Trust,
+    step: Step,
+    good: Bool[Array, ""],
+    ratio: Float[Array, ""],
+    small: Bool[Array, ""],
+    adaptive: bool,
+) -> Trust:
+    """The trust for the next step; the width stays as it is unless it is adaptive.
+
+    The width goes to the length of the Newton step, or to its noise if that is more: where samples
+    are too few to tell, narrower ones would tell even less. Where all is noise it grows, and where
+    the function is flat it grows beyond sigma.
+    """
+    most = math.sqrt(step.p.size)
+    length = jnp.linalg.norm(step.p)
+    radius = trust.radius
+    faithful = step.edge & (jnp.abs(ratio - 1) < _FAITH)
+    change = jnp.where(faithful, 2.0, jnp.where(~good | (ratio < 0.25), 0.5, 1.0))
+    width, factor = trust.width, jnp.ones_like(radius)
+    if adaptive:
+        need = jnp.maximum(jnp.minimum(step.bold, radius) / most, step.spread)
+        factor = jnp.where(step.edge & good, 1, jnp.clip(need, 0.25, 1))
+        factor = jnp.where(length >= _EDGE * most, 1.5, factor)
+        factor = jnp.where(step.blind, jnp.clip(need, 0.5, 1.2), factor)
+        factor = jnp.minimum(factor, jnp.maximum(1 / width, 1))
+        factor = jnp.where(step.flat, 2, factor)
+    # the radius is in widths, and the region shall not shrink only because the width does
+    radius = jnp.maximum(radius * change, _LEAST * most) / jnp.minimum(factor, 1)
+    return Trust(
+        width=width * factor,
+        radius=jnp.minimum(radius, _MOST * most),
+        promised=step.promised,
+        quiet=jnp.where(step.blind | small, trust.quiet + 1, 0),
+        blind=step.blind,
+    )

@@ -1,0 +1,201 @@
+r"""A fit to the samples that are kept: the smoothed function and its derivatives from regression.
+
+Points u are in units of the present width, around the present point. The fit is a Gaussian process
+with a free constant and the kernel
+
+$$ k(u, v) = \frac{u \cdot v}{n} + a \left(\frac{u \cdot v}{n}\right)^2
+   + b\, e^{-|u - v|^2 / 2n}, $$
+
+so that slopes, curvatures and what is neither have a share each. It is exact for a quadratic, needs
+no more samples than there are, and reads n numbers a sample: no n x n array appears. Smoothing with
+N(0, I) keeps every term in closed form, and so are the standard errors.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+# (share of curvatures, share of the rest): mostly the rest, mostly a quadratic, a quadratic
+_SHARES = ((0.1, 1.0), (1.0, 0.1), (1.0, 0.0))
+# the variance of the noise; the first is always safe to factorise
+_RIDGES = (1.0, 1e-1, 1e-3, 1e-6, 1e-10)
+# points farther away than this, in widths, count less and less: the fit is a local one
+_REACH = 2.0
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return jnp.matmul(a, b, precision="highest")
+
+
+class ScalarFit(eqx.Module):
+    """A fit to samples; its methods take the place `at`, a displacement in units of the width."""
+
+    points: Float[Array, "m n"]
+    coefficients: Float[Array, " m"]
+    constant: Float[Array, ""]
+    curved: Float[Array, ""]
+    radial: Float[Array, ""]
+    amplitude: Float[Array, ""]
+    closeness: Float[Array, " m"]
+    factor: Float[Array, "m m"]
+
+    def _products(self, at: Array) -> Array:
+        return _dot(self.points, at) / at.size
+
+    def _bumps(self, at: Array) -> Array:
+        n = at.size
+        away = self.points - at[None]
+        height = (n / (n + 1)) ** (n / 2)
+        return self.radial * height * jnp.exp(-jnp.sum(away * away, axis=1) / (2 * (n + 1)))
+
+    def _value_features(self, at: Array) -> Array:
+        product = self._products(at)
+        size = jnp.sum(self.points * self.points, axis=1) / at.size**2
+        return product + self.curved * (product**2 + size) + self._bumps(at)
+
+    def value(self, at: Float[Array, " n"]) -> Float[Array, ""]:
+        """The smoothed function."""
+        return self.constant + _dot(self.coefficients, self._value_features(at))
+
+    def grad(self, at: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Its gradient."""
+        n = at.size
+        bumps = self.coefficients * self._bumps(at) / (n + 1)
+        slopes = self.coefficients * (1 + 2 * self.curved * self._products(at)) / n
+        return _dot(slopes + bumps, self.points) - jnp.sum(bumps) * at
+
+    def _bends(self, at: Array) -> tuple[Array, Array, Array]:
+        n = at.size
+        bumps = self.coefficients * self._bumps(at) / (n + 1)
+        return 2 * self.curved * self.coefficients / n**2, bumps, self.points - at[None]
+
+    def curvature(self, at: Float[Array, " n"]) -> Callable[[Array], Array]:
+        """Its Hessian as a product with vectors."""
+        bends, bumps, away = self._bends(at)
+
+        def product(v: Array) -> Array:
+            curved = _dot(bends * _dot(self.points, v), self.points)
+            rest = _dot(bumps / (v.size + 1) * _dot(away, v), away)
+            return curved + rest - jnp.sum(bumps) * v
+
+        return product
+
+    def curvature_diagonal(self, at: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The diagonal of its Hessian."""
+        bends, bumps, away = self._bends(at)
+        curved = _dot(bends, self.points**2)
+        return curved + _dot(bumps / (at.size + 1), away**2) - jnp.sum(bumps)[None]
+
+    # Standard errors: what the prior leaves open of a quantity, less what the samples tell of it.
+
+    def _told(self, features: Array) -> Array:
+        near = self.closeness if features.ndim == 1 else self.closeness[:, None]
+        return jax.scipy.linalg.solve_triangular(self.factor, near * features, lower=True)
+
+    def _stderr(self, features: Array, prior: Array) -> Array:
+        told = jnp.sum(self._told(features) ** 2, axis=0)
+        return self.amplitude * jnp.sqrt(jnp.maximum(prior - told, 0))
+
+    def _covariance(self, a: Array, b: Array) -> Array:
+        """Of the smoothed function at two places, before any sample."""
+        n = a.size
+        product = jnp.vdot(a, b)
+        curved = (product**2 + jnp.vdot(a, a) + jnp.vdot(b, b) + n) / n**2
+        height = (n / (n + 2)) ** (n / 2)
+        rest = height * jnp.exp(-jnp.sum((a - b) ** 2) / (2 * (n + 2)))
+        return product / n + self.curved * curved + self.radial * rest
+
+    def value_stderr(self, at: Float[Array, " n"]) -> Float[Array, ""]:
+        """The standard error of the smoothed function."""
+        told = self._told(self._value_features(at))
+        ones = self._told(jnp.ones_like(self.closeness))
+        left = self._covariance(at, at) - jnp.sum(told**2)
+        constant = (1 - jnp.vdot(told, ones)) ** 2 / jnp.sum(ones**2)
+        return self.amplitude * jnp.sqrt(jnp.maximum(left + constant, 0))
+
+    def difference_stderr(self, at: Float[Array, " n"]) -> Float[Array, ""]:
+        """The standard error of `value(at) - value(0)`."""
+        zero = jnp.zeros_like(at)
+        prior = self._covariance(at, at) - 2 * self._covariance(at, zero)
+        features = self._value_features(at) - self._value_features(zero)
+        return self._stderr(features, prior + self._covariance(zero, zero))
+
+    def grad_stderr(self, at: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The standard errors of the gradient's entries."""
+        n = at.size
+        bumps = self._bumps(at) / (n + 1)
+        slopes = (1 + 2 * self.curved * self._products(at)) / n
+        features = (slopes + bumps)[:, None] * self.points - bumps[:, None] * at[None]
+        curved = 2 * self.curved / n**2 * (at**2 + jnp.sum(at**2)[None])
+        rest = self.radial * (n / (n + 2)) ** (n / 2) / (n + 2)
+        return self._stderr(features, curved + (1 / n + rest)[None])
+
+    def curvature_stderr(self, at: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, ""]:
+        """The standard error of v·Hv, for a unit vector."""
+        n = at.size
+        along = _dot(self.points, v)
+        away = along - jnp.vdot(at, v)
+        bumps = self._bumps(at) / (n + 1)
+        features = 2 * self.curved * along**2 / n**2 + bumps * (away**2 / (n + 1) - 1)
+        rest = 3 * self.radial * (n / (n + 2)) ** (n / 2) / (n + 2) ** 2
+        return self._stderr(features, 4 * self.curved / n**2 + rest)
+
+
+def fit(
+    points: Float[Array, "m n"], values: Float[Array, " m"], valid: Bool[Array, " m"]
+) -> ScalarFit:
+    """The fit with the shares and the ridge that make the samples likeliest.
+
+    Samples that are not valid are left out; any values may stand there.
+    """
+    dtype = points.dtype
+    spread = jnp.mean(points * points, axis=1)
+    # noise grows with the sixth power of the distance, as the square of a cubic remainder does
+    closeness = jnp.maximum(1, spread / _REACH**2) ** -1.5
+    closeness = jnp.where(valid, closeness, 0)
+    count = jnp.sum(valid).astype(dtype)
+    known = jnp.where(valid, values, jnp.nan)
+    middle, scale = jnp.nanmedian(known), jnp.nanstd(known)
+    scale = jnp.where(scale > 0, scale, 1)
+    targets = jnp.where(valid, (values - middle) / scale, 0)
+    gram = _dot(points, points.T) / points.shape[1]
+    apart = spread[:, None] + spread[None] - 2 * gram
+    radial = jnp.exp(-jnp.maximum(apart, 0) / 2)
+    weights = closeness[:, None] * closeness[None]
+    sides = closeness[:, None] * jnp.stack([jnp.ones_like(targets), targets], axis=1)
+
+    def solve(choice: Array) -> tuple[Array, ...]:
+        curved, rest, ridge = choice[0], choice[1], choice[2]
+        kernel = weights * (gram + curved * gram**2 + rest * radial)
+        factor = jnp.linalg.cholesky(kernel + ridge * jnp.eye(values.size, dtype=dtype))
+        solved = jax.scipy.linalg.cho_solve((factor, True), sides)
+        mass = jnp.vdot(sides[:, 0], solved[:, 0])
+        constant = jnp.vdot(sides[:, 0], solved[:, 1]) / mass
+        left = solved[:, 1] - constant * solved[:, 0]
+        misfit = jnp.vdot(sides[:, 1] - constant * sides[:, 0], left) / count
+        misfit = jnp.maximum(misfit, jnp.finfo(dtype).tiny)
+        volume = jnp.sum(jnp.log(jnp.diagonal(factor)))
+        volume -= (values.size - count) / 2 * jnp.log(ridge)
+        evidence = -(count - 1) / 2 * jnp.log(misfit) - volume - jnp.log(mass) / 2
+        return evidence, left, constant, misfit, factor
+
+    least = 1e-10 if dtype == jnp.float64 else 1e-5
+    choices = [(*shares, ridge) for ridge in _RIDGES for shares in _SHARES if ridge >= least]
+    table = jnp.asarray(choices, dtype)
+    # one after the other: several factorisations at once have been seen to hang
+    evidence = jax.lax.map(lambda choice: solve(choice)[0], table)
+    choice = table[jnp.argmax(jnp.where(jnp.isfinite(evidence), evidence, -jnp.inf))]
+    _, left, constant, misfit, factor = solve(choice)
+    return ScalarFit(
+        points=points,
+        coefficients=scale * closeness * left,
+        constant=middle + scale * constant,
+        curved=choice[0],
+        radial=choice[1],
+        amplitude=scale * jnp.sqrt(misfit),
+        closeness=closeness,
+        factor=factor,
+    )

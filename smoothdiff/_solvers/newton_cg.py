@@ -1,0 +1,306 @@
+"""Newton steps on the smoothed function, by truncated conjugate gradients, from samples kept."""
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from smoothdiff._batch import Batch, evaluate
+from smoothdiff._estimate import combine
+from smoothdiff._named_baselines import as_baseline
+from smoothdiff._params import Params, take_apart
+from smoothdiff._samplers import AbstractSampler, Sobol
+from smoothdiff._solvers._base import (
+    AbstractSmoothSolver,
+    Progress,
+    all_finite,
+    judge,
+    read_options,
+)
+from smoothdiff._solvers._metric import Metric
+from smoothdiff._solvers._noisy_step import Trust, outcome, propose, revise
+from smoothdiff._solvers._scalar_fit import ScalarFit, fit
+from smoothdiff._stderr import value_stderr
+
+# the most entries of the points that are kept by default, 128 MB in float64
+_MEMORY = 2**24
+# optax and norms mix dtypes, whatever the user's setting
+_promotion = partial(jax.numpy_dtype_promotion, "standard")
+# how strongly the noise of the Hessian's eigenvalues counts in the metric
+_CAUTION = 6.0
+
+
+class NewtonCGState(eqx.Module):
+    """The state of `NewtonCG`: the last point that was accepted, and the samples that are kept."""
+
+    progress: Progress
+    accepted: Float[Array, " n"]
+    points: Float[Array, "m n"]
+    values: Float[Array, " m"]
+    valid: Bool[Array, " m"]
+    metric: Metric
+    trust: Trust
+
+
+class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
+    r"""Newton's method on the smoothed function: each step costs one small batch of evaluations.
+
+    $$ \min_p \; \nabla F \cdot p + \tfrac12 p \cdot \nabla^2 F \, p, \qquad
+       \|p\|_{M^{-1}} \le \Delta $$
+
+    The model of F comes from a regression over the samples of this and of earlier steps, which
+    gives the smoothed value, gradient and Hessian-vector products in closed form, with standard
+    errors. A truncated conjugate-gradient method minimises it within the trust region; it needs no
+    evaluation, and goes down directions of negative curvature to the boundary. What is known of the
+    noise decides how far to go: entries of the gradient are shrunk by their standard errors, the
+    radius by that of the whole gradient, and the test of the last step, made on the new batch, is
+    relaxed by the standard error of the difference.
+
+    With sigma as a number or a pytree the width adapts: it shrinks to the length of the Newton step
+    as far as the noise of that step allows, grows where there is nothing but noise or a plateau,
+    and takes the shape of the Hessian, directions included up to 64 parameters. So sigma says where
+    to begin. With an optax schedule the width is the schedule's.
+
+    Args:
+        sigma: the smoothing width in the units of the parameters: a number or a pytree like the
+            parameters to begin with; or an optax schedule, a function from the number of the step
+            to a number, that is followed.
+        num_samples: evaluations a step; by default 4 + 3 log n for n parameters.
+        history: how many samples are kept, by default (n + 1)(n + 2), but at most 512, and less
+            where they would take more than 128 MB.
+        sampler: where to sample, one whose points are normal.
+        nonfinite: "propagate" a sample that is NaN or infinite, which ends the run with an error,
+            or "drop" it.
+        rtol: relative tolerance. The run has converged when `patience` steps in a row are below
+            `atol + rtol * norm(y)`, or the gradient below its noise.
+        atol: absolute tolerance.
+        norm: the norm of steps and iterates.
+        patience: how many steps in a row that lead nowhere end the run.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, optimistix as optx, smoothdiff as sd
+        >>> plateaus = lambda y, args: jnp.sum(jnp.floor(8 * (y - 1) ** 2))
+        >>> solver = sd.NewtonCG(0.5)
+        >>> solution = optx.minimise(
+        ...     plateaus, solver, jnp.zeros(2), options={"key": jax.random.key(0)},
+        ...     max_steps=20, throw=False
+        ... )
+        >>> [round(float(y), 1) for y in solution.value]
+        [1.0, 1.0]
+
+    Source: Stochastic Gradient Estimation for Higher-order Differentiable Rendering, section 4, for
+    Newton-CG on sampled derivatives; Steihaug 1983 for the inner solver; Sun and Nocedal 2023 for
+    the relaxed test.
+    """
+
+    sigma: PyTree
+    num_samples: int | None
+    history: int | None
+    sampler: AbstractSampler
+    nonfinite: Literal["propagate", "drop"]
+    rtol: float
+    atol: float
+    norm: Callable[[PyTree], Float[Array, ""]]
+    patience: int
+
+    def __init__(
+        self,
+        sigma: PyTree,
+        *,
+        num_samples: int | None = None,
+        history: int | None = None,
+        sampler: AbstractSampler = Sobol(),  # noqa: B008 (a frozen module)
+        nonfinite: Literal["propagate", "drop"] = "propagate",
+        rtol: float = 0.0,
+        atol: float = 0.0,
+        norm: Callable[[PyTree], Float[Array, ""]] = optx.max_norm,
+        patience: int = 50,
+    ):
+        for name, value in (("num_samples", num_samples), ("history", history)):
+            if value is not None and value < 2:
+                raise ValueError(f"{name} must be at least 2, or None for the default: {value}")
+        self.sigma = sigma
+        self.num_samples = num_samples
+        self.history = history
+        self.sampler = sampler
+        self.nonfinite = nonfinite
+        self.rtol = rtol
+        self.atol = atol
+        self.norm = norm
+        self.patience = patience
+
+    @property
+    def _adaptive(self) -> bool:
+        return not callable(self.sigma)
+
+    def _sigma_at(self, step: Int[Array, ""]) -> PyTree:
+        with _promotion():
+            return self.sigma(step) if callable(self.sigma) else self.sigma
+
+    def _params(self, y: PyTree, step: Int[Array, ""], options: dict[str, Any]) -> Params:
+        params = take_apart(y, self._sigma_at(step), read_options(options)[1])
+        if params.free:
+            raise ValueError("NewtonCG needs a sigma for every leaf: it has no other derivatives")
+        return params
+
+    def evaluations_per_step(self, y: PyTree[Array]) -> int:
+        """One batch."""
+        if self.num_samples is not None:
+            return self.num_samples
+        size = sum(leaf.size for leaf in jax.tree.leaves(y))
+        return 4 + int(3 * math.log(size))
+
+    def final_evaluations(self, y: PyTree[Array]) -> int:
+        """A batch for each of the three candidates."""
+        return 3 * self.evaluations_per_step(y)
+
+    def _kept(self, y: PyTree[Array], n: int) -> int:
+        usual = min((n + 1) * (n + 2), 512, max(_MEMORY // n, 64))
+        return max(usual if self.history is None else self.history, self.evaluations_per_step(y))
+
+    def _batch(self, fn, y, args, params: Params, metric: Metric, width, step, options) -> Batch:
+        """One batch around y; its points are in units of the width."""
+        unit = take_apart(jnp.zeros_like(params.theta), 1.0, None)
+
+        def fun(u: Array, _: list) -> tuple[Array, PyTree]:
+            x = _bounded(params, metric, params.theta, u, width)
+            return fn(params.layout.tree(x), args)
+
+        batch = evaluate(
+            fun,
+            unit,
+            jax.random.fold_in(read_options(options)[0], step),
+            num_samples=self.evaluations_per_step(y),
+            sampler=self.sampler,
+            baseline=as_baseline("mean"),
+            batch_size=None,
+            nonfinite=self.nonfinite,
+        )
+        if batch.log_ratio is not None or not self.sampler.gaussian:
+            raise ValueError(f"{self.sampler} has weights: NewtonCG needs points that are normal")
+        return batch
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> NewtonCGState:
+        """Checks what can be looked at; evaluates nothing."""
+        step = jnp.asarray(0, jnp.int32)
+        params = self._params(y, step, options)
+        theta, n = params.theta, params.theta.size
+        kept = self._kept(y, n)
+        return NewtonCGState(
+            progress=Progress.start(y, f_struct.dtype),
+            accepted=theta,
+            points=jnp.broadcast_to(theta, (kept, n)),
+            values=jnp.zeros(kept, theta.dtype),
+            valid=jnp.zeros(kept, bool),
+            metric=Metric.of(params.sigma, self._adaptive),
+            trust=Trust.start(n, theta.dtype),
+        )
+
+    def step(self, fn, y, args, options, state, tags):
+        """One batch, one Newton step from all samples that are kept."""
+        progress, trust = state.progress, state.trust
+        params = self._params(y, progress.step, options)
+        theta = params.theta
+        metric = state.metric if self._adaptive else Metric.of(params.sigma, False)
+        batch = self._batch(fn, y, args, params, metric, trust.width, progress.step, options)
+        z = batch.draws.map(lambda z, _: z)
+        points = jax.vmap(lambda u: _bounded(params, metric, theta, u, trust.width))(z)
+        fresh = jnp.isfinite(batch.values) if batch.valid is None else batch.valid
+        kept = [
+            jnp.concatenate([old[len(z) :], new.astype(old.dtype)])
+            for old, new in (
+                (state.points, points),
+                (state.values, batch.values),
+                (state.valid, fresh),
+            )
+        ]
+        model = fit(metric.into(kept[0] - theta[None]) / trust.width, kept[1], kept[2])
+
+        before = metric.into(state.accepted - theta) / trust.width
+        good, ratio = outcome(model, before, trust.promised)
+        at, base = jnp.where(good, 0, before), jnp.where(good, theta, state.accepted)
+        new_metric, turn = (
+            _adapted(metric, model, at) if self._adaptive else (metric, metric.unit())
+        )
+
+        def confine(p: Array) -> Array:
+            if params.low is None:
+                return p
+            x = _bounded(params, new_metric, base, p, trust.width)
+            return new_metric.into(x - base) / trust.width
+
+        step = propose(model, at, turn, trust.radius, confine)
+        x = params.clip(base + trust.width * new_metric.out(step.p))
+        new_y = params.layout.tree(x)
+        with _promotion():
+            length = self.norm(params.layout.tree(x - base))
+            small = length < self.atol + self.rtol * self.norm(y)
+        new_trust = revise(trust, step, good, ratio, small, self._adaptive)
+        finite = all_finite((batch.values if batch.valid is None else batch.scale, x))
+        # a failed step leaves everything as it was
+        new, old = (
+            (new_y, base, *kept, new_metric, new_trust),
+            ((y, state.accepted, state.points, state.values, state.valid, state.metric, trust)),
+        )
+        new_y, *rest = jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, old)
+        progress = progress.after(
+            y,
+            model.value(jnp.zeros_like(at)),
+            model.value_stderr(jnp.zeros_like(at)),
+            trust.width * metric.widest(),
+            len(z),
+            finite,
+        )
+        # the function was never evaluated at y itself, so its aux is that of a sample near y
+        aux = jax.tree.map(lambda a: a[0], batch.aux)
+        return new_y, NewtonCGState(progress, *rest), aux
+
+    def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
+        """After `patience` steps in a row that led nowhere, or a failed step."""
+        finite = state.progress.finite
+        result = optx.RESULTS.where(finite, optx.RESULTS.successful, optx.RESULTS.nonfinite)
+        return (state.trust.quiet >= self.patience) | ~finite, result
+
+    def reason(self, state: NewtonCGState) -> str:
+        """Small steps, or a gradient that is all noise however many samples there are."""
+        return "noise" if state.trust.blind else "converged"
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        """Judges the last point, the last accepted and the best recorded on fresh samples."""
+        progress = state.progress
+
+        def estimate(y):
+            params = self._params(y, progress.step, options)
+            metric = state.metric if self._adaptive else Metric.of(params.sigma, False)
+            width = state.trust.width
+            batch = self._batch(fn, y, args, params, metric, width, progress.step, options)
+            value = combine(batch, jnp.zeros_like(params.theta))
+            return value, value_stderr(batch, value)
+
+        params = self._params(y, progress.step, options)
+        accepted = params.layout.tree(state.accepted)
+        y, fun, stderr = judge(estimate, y, accepted, progress.best_y)
+        evaluations = progress.evaluations + self.final_evaluations(y)
+        return y, aux, {"fun": fun, "stderr": stderr, "evaluations": evaluations}
+
+
+def _adapted(metric: Metric, model: ScalarFit, at: Array) -> tuple[Metric, Metric]:
+    """The metric of the model's Hessian, and the change to it."""
+    grad = model.grad(at)
+    size = jnp.linalg.norm(grad)
+    along = grad / jnp.maximum(size, jnp.finfo(grad.dtype).tiny)
+    noise = _CAUTION * math.sqrt(grad.size) * model.curvature_stderr(at, along)
+    return metric.adapted(model.curvature(at), model.curvature_diagonal(at), noise)
+
+
+def _bounded(params: Params, metric: Metric, base: Array, u: Array, width: Array) -> Array:
+    """The point u widths from `base`, within the bounds."""
+    if params.low is None or params.high is None:
+        return base + metric.out(width * u)
+    return metric.bounded(base, width * u, params.low, params.high)

@@ -1,0 +1,211 @@
+"""Gauss-Newton on residuals: known optima, bounds, plateaus, faults, optimistix's solvers."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+import smoothdiff as sd
+
+KEY = jax.random.key(3)
+DESIGN = np.random.default_rng(0).normal(size=(6, 3))
+DATA = np.random.default_rng(1).normal(size=6)
+TIMES = np.linspace(0, 1, 20)
+PIXELS = np.arange(32)
+
+
+def line(y, args):
+    """Linear, and not zero anywhere."""
+    return jnp.asarray(DESIGN, y.dtype) @ y - jnp.asarray(DATA, y.dtype)
+
+
+def decay(y, noise):
+    t = jnp.asarray(TIMES, y.dtype)
+    data = 2 * jnp.exp(-3 * t) + 0.5 + noise
+    return y[0] * jnp.exp(-y[1] * t) + y[2] - data
+
+
+def bars(y, target):
+    """Two bars of seven pixels; the middle of each plateau is at a whole number."""
+    draw = lambda y: (jnp.abs(jnp.asarray(PIXELS, y.dtype)[None] - y[:, None]) <= 3.5).astype(
+        y.dtype
+    )
+    return draw(y) - draw(target)
+
+
+def tree(y, args):
+    return {"first": y["a"] - 1, "second": [y["b"] * y["a"] - jnp.full((2,), 3, y["b"].dtype)]}
+
+
+def solve(fun, y0, args=None, sigma: Any = 0.3, evaluations=200, bounds=None, **options):
+    solver = sd.GaussNewton(sigma, **options)
+    return sd.least_squares(
+        fun, y0, args, key=KEY, solver=solver, max_evaluations=evaluations, bounds=bounds
+    )
+
+
+def test_a_linear_problem_is_solved_though_its_residuals_never_vanish(dtype):
+    result = solve(line, jnp.zeros(3, dtype), sigma=1.0)
+    best = np.linalg.lstsq(DESIGN, DATA)[0]
+    assert result.y.dtype == dtype
+    # the sum of squares is flat to the root of the rounding error
+    np.testing.assert_allclose(result.y, best, atol=float(jnp.finfo(dtype).eps) ** 0.5)
+    assert result.fun == pytest.approx(np.sum((DESIGN @ best - DATA) ** 2) / 2, rel=1e-3)
+
+
+def test_a_curve_without_noise_is_fitted_to_rounding(dtype):
+    noise = jnp.zeros(20, dtype)
+    result = solve(decay, jnp.ones(3, dtype), noise, evaluations=300)
+    np.testing.assert_allclose(result.y, [2, 3, 0.5], atol=2e3 * float(jnp.finfo(dtype).eps))
+
+
+def test_a_curve_with_noise_goes_to_the_least_squares_solution(x64):
+    noise = 0.1 * jnp.asarray(np.random.default_rng(2).normal(size=20))
+    exact = optx.least_squares(decay, optx.LevenbergMarquardt(1e-10, 1e-10), jnp.ones(3), noise)
+    result = solve(decay, jnp.ones(3), noise, evaluations=400)
+    # 20 times closer than the truth is, which a standard error of the noise separates from it
+    distance = np.linalg.norm(exact.value - np.array([2, 3, 0.5]))
+    assert np.linalg.norm(result.y - exact.value) < distance / 20
+
+
+@pytest.mark.parametrize("bound", [(-0.1, 0.1), (-5.0, 0.3)])
+def test_bounds_give_the_constrained_solution(bound, x64):
+    from scipy.optimize import lsq_linear
+
+    seen = []
+
+    def watched(y, args):
+        jax.debug.callback(lambda y: seen.append(np.asarray(y)), y)
+        return line(y, args)
+
+    result = solve(watched, jnp.zeros(3), sigma=0.1, bounds=bound)
+    jax.effects_barrier()
+    np.testing.assert_allclose(result.y, lsq_linear(DESIGN, DATA, bound).x, atol=1e-6)
+    assert seen
+    assert all(np.all((bound[0] <= y) & (y <= bound[1])) for y in seen)
+
+
+def test_plateaus_lead_to_their_middle(dtype):
+    y0, target = jnp.array([8.0, 25.0], dtype), jnp.array([14.0, 20.0], dtype)
+    result = solve(bars, y0, target, sigma=3.0)
+    assert jnp.all(bars(result.y, target) == 0)
+    np.testing.assert_allclose(result.y, target, atol=0.1)
+
+
+def test_one_plateau_everywhere_widens_sigma():
+    flat = lambda y, args: jnp.stack([jnp.where(jnp.abs(y) < 50, 1.0, 0.0), 0.0])
+    result = solve(flat, jnp.array(0.0), sigma=1.0, evaluations=60)
+    widths = [record.sigma for record in result.history]
+    assert widths[:4] == pytest.approx([1, 2, 4, 8])
+
+
+def test_iterates_are_those_of_optimistix_to_the_last_bit(dtype):
+    y0, target, bounds = jnp.array([8, 25], dtype), jnp.array([14, 20], dtype), (0.0, 31.0)
+    solver = sd.GaussNewton(3.0)
+    options = {"key": KEY, "bounds": bounds}
+    solution = optx.least_squares(bars, solver, y0, target, options, max_steps=8, throw=False)
+    result = sd.least_squares(bars, y0, target, key=KEY, solver=solver, max_steps=8, bounds=bounds)
+    np.testing.assert_array_equal(result.y, solution.value)
+    for name in ("fun", "stderr", "evaluations"):
+        assert getattr(result, name) == solution.stats[name]
+    assert result.evaluations == 10 * solver.evaluations_per_step(y0)
+
+
+def test_runs_inside_jit_over_pytrees():
+    solver = sd.GaussNewton({"a": 0.2, "b": 0.5})
+
+    @jax.jit
+    def run(key, y0):
+        options = {"key": key}
+        return optx.least_squares(
+            tree, solver, y0, options=options, max_steps=25, throw=False
+        ).value
+
+    y0 = {"a": jnp.array(0.3), "b": jnp.zeros(2)}
+    y = run(KEY, y0)
+    assert jax.tree.structure(y) == jax.tree.structure(y0)
+    np.testing.assert_allclose(y["a"], 1, atol=1e-3)
+    np.testing.assert_allclose(y["b"], 3, atol=3e-3)
+
+
+def test_many_parameters_need_no_square_matrix_of_them():
+    n = 5_000
+    fun = lambda y, args: jnp.stack([jnp.sum(y[::2]), jnp.sum(y[1::2])]) / n**0.5 - 1
+    result = solve(fun, jnp.zeros(n), sigma=0.1, evaluations=300, num_samples=16)
+    assert result.fun < 0.5 * result.history[0].fun
+
+
+def test_a_schedule_is_taken_as_it_is():
+    schedule = lambda step: 0.5 / (step + 1)
+    solver = sd.GaussNewton(schedule)
+    result = sd.least_squares(line, jnp.zeros(3), key=KEY, solver=solver, max_steps=4)
+    assert [r.sigma for r in result.history] == pytest.approx([0.5, 0.25, 0.5 / 3, 0.125])
+
+
+def test_converges_by_tolerance():
+    solver = sd.GaussNewton(0.3, rtol=1e-2, atol=1e-2)
+    noise = jnp.zeros(20)
+    result = sd.least_squares(decay, jnp.ones(3), noise, key=KEY, solver=solver)
+    assert result.reason == "converged"
+    np.testing.assert_allclose(result.y, [2, 3, 0.5], atol=0.02)
+
+
+def test_nan_during_a_step_keeps_what_was_found():
+    broken = lambda y, args: jnp.where(y[0] > 0.7, jnp.nan, 1.0) * (y - 1)
+    with pytest.raises(sd.MinimiseError, match="NaN or infinite") as caught:
+        solve(broken, jnp.zeros(2), sigma=0.1)
+    result = caught.value.result
+    assert result.reason == "nonfinite"
+    assert np.all(np.isfinite(result.y))
+    assert result.history
+
+
+def test_bad_samples_are_left_out():
+    broken = lambda y, args: jnp.where(y[0] > 1.05, jnp.nan, 1.0) * (y - 1)
+    result = solve(broken, jnp.full(2, 0.5), sigma=0.1, nonfinite="drop")
+    np.testing.assert_allclose(result.y, 1, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: sd.GaussNewton(0.1, num_samples=2),
+        lambda: sd.GaussNewton(0.1, num_samples=8, history=4),
+        lambda: solve(line, jnp.zeros(3), sigma=-1.0),
+        lambda: solve(tree, {"a": jnp.ones(()), "b": jnp.ones(2)}, sigma={"a": 1.0, "b": None}),
+    ],
+)
+def test_bad_settings_are_refused(make):
+    with pytest.raises(ValueError, match=r"num_samples|history|sigma"):
+        make()
+
+
+def test_wrong_kinds_are_refused():
+    integers = lambda y, args: jnp.round(y).astype(int)
+    with pytest.raises(TypeError, match="astype"):
+        solve(integers, jnp.zeros(2))
+    solver: Any = sd.GaussNewton(0.1)
+    with pytest.raises(TypeError, match="solver"):
+        sd.minimise(line, jnp.zeros(3), key=KEY, solver=solver)
+    solver = optx.LevenbergMarquardt(1e-3, 1e-3)
+    with pytest.raises(TypeError, match="smoothdiff's"):
+        sd.least_squares(line, jnp.zeros(3), key=KEY, solver=solver)
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [optx.LevenbergMarquardt(1e-4, 1e-4), optx.BFGS(1e-4, 1e-4), optx.NonlinearCG(1e-4, 1e-4)],
+    ids=lambda solver: type(solver).__name__,
+)
+def test_solvers_of_optimistix_run_on_a_smoothed_function(solver):
+    target = jnp.array([14.0, 20.0])
+    residuals = sd.smooth(lambda y: bars(y, target), 3.0, num_samples=64, baseline="mean")
+    fixed = lambda y, args: residuals(KEY, y)
+    y0 = jnp.array([12.0, 21.5])
+    before = jnp.sum(fixed(y0, None) ** 2)
+    solution = optx.least_squares(fixed, solver, y0, max_steps=40, throw=False)
+    assert jnp.sum(fixed(solution.value, None) ** 2) < before
+    np.testing.assert_allclose(solution.value, target, atol=1.0)
