@@ -24,7 +24,7 @@ def main(arguments: list[str] | None = None, results: Path = RESULTS) -> None:
     run.add_argument("tasks", nargs="+", metavar="TASK", choices=tasks.TASKS)
     run.add_argument("--full", action="store_true", help="every start, at full size")
     run.add_argument("--seeds", type=int, metavar="N", help="number of starts")
-    run.add_argument("--methods", metavar="A,B", help="only these, separated by commas")
+    run.add_argument("--methods", metavar="A,B", help="these, separated by commas")
     run.add_argument("--fresh", action="store_true", help="run again what has been run")
     commands.add_parser("overhead", help="derivatives against evaluating at the same points")
     errors = commands.add_parser("variance", help="errors of derivatives, for what they cost")
@@ -90,7 +90,8 @@ def _run_task(task: Task, options: argparse.Namespace, folder: Path, command: st
     from benchmarks._harness import run
 
     setting = "full" if options.full else "quick"
-    chosen = options.methods.split(",") if options.methods else methods.METHODS
+    usual = methods.METHODS if options.full else methods.QUICK
+    chosen = options.methods.split(",") if options.methods else usual
     found = run(
         task,
         [methods.load(method) for method in chosen],

@@ -38,6 +38,17 @@ METHODS = {
     "gauss_newton": "benchmarks.methods.gauss_newton",
 }
 
+# what runs unless more is asked for: the usual choices, the papers' best, and ours
+QUICK = (
+    "finite_differences",
+    "fr22",
+    "cma_es",
+    "mitsuba_ad",
+    "our_hvpa",
+    "newton_cg",
+    "gauss_newton",
+)
+
 
 def load(name: str) -> Method:
     """A method by its name."""

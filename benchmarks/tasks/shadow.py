@@ -41,6 +41,7 @@ def build(full: bool) -> Task:
         budget=Budget(evaluations=600, seconds=8),
         seeds=20 if full else 5,
         image=image,
+        residuals=lambda y: render(y) - photo,
         native_ad=native_ad,
         notes=f"{resolution} x {resolution} pixels, {spp} samples per pixel, {variant}",
     )

@@ -89,7 +89,7 @@ def _problem(problem: dict[str, Any], path: Path) -> None:
                 _lines(axis, estimators, PEERS, quantity, cost)
                 axis.set_title(QUANTITIES[quantity])
             line[0].set_ylabel("Relative RMSE")
-        _legend(drawn, axes, 4)
+        _legend(drawn, axes, min(4, 1 + len(quantities)))
         drawn.suptitle(problem["title"], x=0.01, ha="left", fontsize=10)
 
 

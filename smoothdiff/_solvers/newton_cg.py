@@ -67,6 +67,10 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     and takes the shape of the Hessian, directions included up to 64 parameters. So sigma says where
     to begin. With an optax schedule the width is the schedule's.
 
+    Bounds are never left. A sample beyond them is clamped or, where that would throw it out of a
+    narrow valley, pulled back along its ray, and the regression takes it where it was evaluated.
+    (The transforms weight unclamped points instead; for a fit that breaks the model.)
+
     Args:
         sigma: the smoothing width in the units of the parameters: a number or a pytree like the
             parameters to begin with; or an optax schedule, a function from the number of the step
