@@ -53,7 +53,7 @@ def legend(drawn: Figure, handles: list, labels: list[str]) -> None:
         drawn.set_size_inches(width + 3.5, max(height, 0.2 * len(labels) + 0.6))
         drawn.legend(handles, labels, loc="outside right center", handlelength=3.5)
     else:
-        drawn.legend(handles, labels, loc="outside lower center", ncols=min(4, len(labels)))
+        drawn.legend(handles, labels, loc="outside lower center", ncols=min(3, len(labels)))
 
 
 def looks(names) -> dict[str, dict]:

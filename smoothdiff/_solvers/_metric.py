@@ -10,7 +10,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 # most parameters for which directions are adapted with the widths; beyond, widths only, O(n)
 MOST_DIRECTIONS = 64
@@ -73,6 +73,22 @@ class Metric(eqx.Module):
         forth, back = share(move), share(-move)
         ray = jnp.where(back > forth, -move, move) * jnp.minimum(jnp.maximum(forth, back), 1)
         return jnp.where(near, clamped, jnp.clip(center + ray, low, high))
+
+    def slope(self, grad: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The gradient in the parameters from that in units of the width."""
+        return _apply(self.inverse.T, grad)
+
+    def holding(self, held: Bool[Array, " n"]) -> Callable[[Array], Array]:
+        """Takes from a step, in units of the width, what would move parameters that are held."""
+        if self.matrix.ndim == 1:
+            return lambda u: jnp.where(held, 0, u)
+        rows = jnp.where(held[:, None], self.matrix, 0)
+        inverse = jnp.linalg.pinv(rows)
+
+        def hold(u: Array) -> Array:
+            return u - _apply(inverse, _apply(rows, u))
+
+        return hold
 
     def adapted(
         self,

@@ -85,16 +85,18 @@ def propose(
     at: Float[Array, " n"],
     turn: Metric,
     radius: Float[Array, ""],
+    hold: Callable[[Array], Array],
     confine: Callable[[Array], Array],
 ) -> Step:
     """The step that the model asks for at the place `at`, as far as it is to be believed.
 
-    The step and the radius are in the turned metric. `confine` gives what bounds leave of a step.
+    The step and the radius are in the turned metric. `hold` takes from a step what would
+    move parameters that stay at their bounds, and `confine` gives what all bounds leave of it.
     """
     bend = model.curvature(at)
 
     def curvature(p: Array) -> Array:
-        return turn.out(bend(turn.out(p)))
+        return hold(turn.out(bend(turn.out(hold(p)))))
 
     grad, error = model.grad(at), model.grad_stderr(at)
     size = jnp.linalg.norm(grad)
@@ -103,14 +105,14 @@ def propose(
     chance = jnp.sqrt(count) * jnp.linalg.norm(_ratio(grad, size) * error)
     sure = jnp.minimum(1, _ratio(size, _SURE * chance) ** _STEEP)
     # positive-part James-Stein: an entry within its noise says nothing
-    believed = turn.out(grad * jnp.maximum(0, 1 - _ratio(error, jnp.abs(grad)) ** 2))
+    believed = hold(turn.out(grad * jnp.maximum(0, 1 - _ratio(error, jnp.abs(grad)) ** 2)))
     most = math.sqrt(grad.size)
     reach = jnp.minimum(radius * sure, most)
     p = confine(truncated_cg(curvature, believed, reach))
     promised = -(jnp.vdot(believed, p) + jnp.vdot(p, curvature(p)) / 2)
     # bounds can leave of a step what is worse than none
     p = jnp.where(promised > 0, p, 0)
-    bold = truncated_cg(curvature, turn.out(grad), jnp.minimum(radius, most))
+    bold = truncated_cg(curvature, hold(turn.out(grad)), jnp.minimum(radius, most))
     bent = jnp.abs(jnp.vdot(bold, curvature(bold)))
     ahead = turn.out(bold)
     error_ahead = jnp.linalg.norm(_ratio(ahead, jnp.linalg.norm(ahead)) * error)

@@ -20,8 +20,8 @@ from jaxtyping import Array, Bool, Float
 
 # (share of curvatures, share of the rest): mostly the rest, mostly a quadratic, a quadratic
 _SHARES = ((0.1, 1.0), (1.0, 0.1), (1.0, 0.0))
-# the variance of the noise; the first is always safe to factorise
-_RIDGES = (1.0, 1e-1, 1e-3, 1e-6, 1e-10)
+# the variance of the noise: the first is always safe to factorise, the last as small as may be
+_RIDGES = {"float32": (1.0, 1e-1, 1e-3, 1e-4), "float64": (1.0, 1e-1, 1e-3, 1e-6, 1e-8)}
 # points farther away than this, in widths, count less and less: the fit is a local one
 _REACH = 2.0
 
@@ -182,8 +182,7 @@ def fit(
         evidence = -(count - 1) / 2 * jnp.log(misfit) - volume - jnp.log(mass) / 2
         return evidence, left, constant, misfit, factor
 
-    least = 1e-10 if dtype == jnp.float64 else 1e-5
-    choices = [(*shares, ridge) for ridge in _RIDGES for shares in _SHARES if ridge >= least]
+    choices = [(*shares, ridge) for ridge in _RIDGES[dtype.name] for shares in _SHARES]
     table = jnp.asarray(choices, dtype)
     # one after the other: several factorisations at once have been seen to hang
     evidence = jax.lax.map(lambda choice: solve(choice)[0], table)

@@ -233,14 +233,20 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
             _adapted(metric, model, at) if self._adaptive else (metric, metric.unit())
         )
 
+        held = _held(params, base, metric.slope(model.grad(at)), trust.width * metric.widest())
+        hold = (lambda p: p) if held is None else new_metric.holding(held)
+
         def confine(p: Array) -> Array:
-            if params.low is None:
+            if held is None:
                 return p
             x = _bounded(params, new_metric, base, p, trust.width)
             return new_metric.into(x - base) / trust.width
 
-        step = propose(model, at, turn, trust.radius, confine)
+        step = propose(model, at, turn, trust.radius, hold, confine)
         x = params.clip(base + trust.width * new_metric.out(step.p))
+        if held is not None:
+            # to the last bit, or it would not be at its bound in the next step
+            x = jnp.where(held, base, x)
         new_y = params.layout.tree(x)
         with _promotion():
             length = self.norm(params.layout.tree(x - base))
@@ -308,3 +314,12 @@ def _bounded(params: Params, metric: Metric, base: Array, u: Array, width: Array
     if params.low is None or params.high is None:
         return base + metric.out(width * u)
     return metric.bounded(base, width * u, params.low, params.high)
+
+
+def _held(params: Params, x: Array, slope: Array, width: Array) -> Array | None:
+    """Which parameters are at a bound that the descent would cross; None without bounds."""
+    if params.low is None or params.high is None:
+        return None
+    # a step to a bound ends there but for rounding
+    near = 100 * jnp.finfo(x.dtype).eps * (jnp.abs(x) + width)
+    return ((x <= params.low + near) & (slope > 0)) | ((x >= params.high - near) & (slope < 0))
