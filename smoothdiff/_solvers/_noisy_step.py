@@ -102,10 +102,13 @@ def propose(
     size = jnp.linalg.norm(grad)
     # noise has no more dimensions than there are samples
     count = jnp.minimum(grad.size, jnp.sum(model.closeness > 0)).astype(grad.dtype)
-    chance = jnp.sqrt(count) * jnp.linalg.norm(_ratio(grad, size) * error)
+    chance = jnp.sqrt(count) * model.slope_stderr(at, _ratio(grad, size))
     sure = jnp.minimum(1, _ratio(size, _SURE * chance) ** _STEEP)
-    # positive-part James-Stein: an entry within its noise says nothing
-    believed = hold(turn.out(grad * jnp.maximum(0, 1 - _ratio(error, jnp.abs(grad)) ** 2)))
+    # positive-part James-Stein: what is within its noise says nothing. With fewer samples than
+    # entries none of these can be told apart, and the gradient is shrunk as a whole.
+    few = grad.size > len(model.points)
+    doubt = _ratio(chance, size) if few else _ratio(error, jnp.abs(grad))
+    believed = hold(turn.out(grad * jnp.maximum(0, 1 - doubt**2)))
     most = math.sqrt(grad.size)
     reach = jnp.minimum(radius * sure, most)
     p = confine(truncated_cg(curvature, believed, reach))
@@ -115,7 +118,7 @@ def propose(
     bold = truncated_cg(curvature, hold(turn.out(grad)), jnp.minimum(radius, most))
     bent = jnp.abs(jnp.vdot(bold, curvature(bold)))
     ahead = turn.out(bold)
-    error_ahead = jnp.linalg.norm(_ratio(ahead, jnp.linalg.norm(ahead)) * error)
+    error_ahead = model.slope_stderr(at, _ratio(ahead, jnp.linalg.norm(ahead)))
     return Step(
         p=p,
         promised=jnp.maximum(promised, 0),

@@ -123,15 +123,28 @@ class ScalarFit(eqx.Module):
         features = self._value_features(at) - self._value_features(zero)
         return self._stderr(features, prior + self._covariance(zero, zero))
 
+    def _grad_features(self, at: Array) -> tuple[Array, Array]:
+        """Weights of the points and of the place in the gradient's features."""
+        bumps = self._bumps(at) / (at.size + 1)
+        return (1 + 2 * self.curved * self._products(at)) / at.size + bumps, bumps
+
     def grad_stderr(self, at: Float[Array, " n"]) -> Float[Array, " n"]:
         """The standard errors of the gradient's entries."""
+        slopes, bumps = self._grad_features(at)
+        features = slopes[:, None] * self.points - bumps[:, None] * at[None]
+        return self._stderr(features, self._grad_prior(at, at**2))
+
+    def slope_stderr(self, at: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, ""]:
+        """The standard error of the gradient along a unit vector."""
+        slopes, bumps = self._grad_features(at)
+        along = jnp.vdot(at, v)
+        features = slopes * _dot(self.points, v) - bumps * along
+        return self._stderr(features, self._grad_prior(at, along**2))
+
+    def _grad_prior(self, at: Array, along: Array) -> Array:
         n = at.size
-        bumps = self._bumps(at) / (n + 1)
-        slopes = (1 + 2 * self.curved * self._products(at)) / n
-        features = (slopes + bumps)[:, None] * self.points - bumps[:, None] * at[None]
-        curved = 2 * self.curved / n**2 * (at**2 + jnp.sum(at**2)[None])
-        rest = self.radial * (n / (n + 2)) ** (n / 2) / (n + 2)
-        return self._stderr(features, curved + (1 / n + rest)[None])
+        curved = 2 * self.curved / n**2 * (along + jnp.vdot(at, at))
+        return curved + 1 / n + self.radial * (n / (n + 2)) ** (n / 2) / (n + 2)
 
     def curvature_stderr(self, at: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, ""]:
         """The standard error of v·Hv, for a unit vector."""
