@@ -95,8 +95,8 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         ...     plateaus, solver, jnp.zeros(2), options={"key": jax.random.key(0)},
         ...     max_steps=20, throw=False
         ... )
-        >>> [round(float(y), 1) for y in solution.value]
-        [1.0, 1.0]
+        >>> [round(float(y)) for y in solution.value]
+        [1, 1]
 
     Source: Stochastic Gradient Estimation for Higher-order Differentiable Rendering, section 4, for
     Newton-CG on sampled derivatives; Steihaug 1983 for the inner solver; Sun and Nocedal 2023 for
