@@ -36,6 +36,7 @@ EXPECTED = {
     "our_h": (2000, 0.5, 4 * 2 + 2 * (4 * 2 + 4 * 3) + 4 * 2),
     "our_hvp": (2000, 0.3, 4 * 2 + 2 * (4 * 2 + 2 * 4 * 2) + 4 * 2),
     "our_hvpa": (2000, 0.3, 12 + 3 * (12 + 2 * 12) + 12),
+    # without safeguards it need not converge, and does not here: only bounds and counts are asked of it
     "newton": (500, math.inf, 4 * 2 + 4 * 3),
     "newton_modified": (2000, 0.5, 4 * 2 + 4 * 3),
     "bfgs": (2000, 0.1, 4 * 2),
@@ -93,10 +94,10 @@ def test_progress_bounds_and_counts(name):
     task, seen = bowl(evaluations)
     counter = _harness.Counter()
     watched = _harness._watched(task, counter)
-    try:
-        solve = methods.load(name).prepare(watched)
-    except NotAble as reason:
-        pytest.skip(str(reason))
+    # GPL, so it is no part of the extra for tests; a method of any other package has to run
+    if name == "py_bobyqa":
+        pytest.importorskip("pybobyqa", reason='needs pip install -e ".[peers]"')
+    solve = methods.load(name).prepare(watched)
     run = _harness._solve(watched, solve, 0, counter, task.exact_loss)
     assert run["image_error"][-1] <= left
     assert counter.evaluations == len(seen)
