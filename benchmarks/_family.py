@@ -72,7 +72,7 @@ def _titles(results: dict[str, Any]) -> dict[str, str]:
 
 def _cell(found: dict[str, Any]) -> str:
     reached = found["gap"]["levels"][LEVEL]
-    median = reached["evaluations"][1]
+    median = reached["evaluations"]["median"]
     solved = f"{reached['solved']}/{found['starts']}"
     return f"{'-' if median is None else round(median)} ({solved})"
 
@@ -113,7 +113,7 @@ def draw(results: dict[str, Any], path: Path) -> None:
 def _line(axis, tasks: list[dict[str, Any]], method: str, look: dict[str, Any]) -> None:
     """The medians of a method over the dimensions; open where there is none."""
     levels = [task["methods"][method]["gap"]["levels"][LEVEL] for task in tasks]
-    medians = [level["evaluations"][1] for level in levels]
+    medians = [level["evaluations"]["median"] for level in levels]
     reached = [
         (task["dimensions"], y) for task, y in zip(tasks, medians, strict=True) if y is not None
     ]

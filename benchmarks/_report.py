@@ -162,8 +162,9 @@ def _left(results: dict[str, Any]) -> Table:
     return shown
 
 
-def _show(quartiles: list[float | None]) -> str:
+def _show(quartiles: dict[str, float | None]) -> str:
     low, middle, high = (
-        "-" if q is None else f"{q:.2g}" if q < 10 else f"{q:.0f}" for q in quartiles
+        "-" if q is None else f"{q:.2g}" if q < 10 else f"{q:.0f}"
+        for q in (quartiles[name] for name in ("lower", "median", "upper"))
     )
     return middle if middle == low == high else f"{middle} \\[{low}, {high}]"

@@ -81,11 +81,15 @@ def cost_to_level(errors: Sequence[float], costs: Sequence[float], level: float)
     return next((c for e, c in zip(errors, costs, strict=True) if e <= level), math.inf)
 
 
-def _quartiles(values: Sequence[float]) -> list[float | None]:
-    """Lower quartile, median, upper quartile; None stands for infinity, which JSON lacks."""
+def _quartiles(values: Sequence[float]) -> dict[str, float | None]:
+    """Median, lower and upper quartile; None stands for infinity, which JSON lacks.
+
+    By name: in a list the first is easily taken for the median.
+    """
     # "higher" takes values as they are: between a number and infinity there is no mean
-    quartiles = np.quantile(values, [0.25, 0.5, 0.75], method="higher")
-    return [float(q) if math.isfinite(q) else None for q in quartiles]
+    quartiles = np.quantile(values, [0.5, 0.25, 0.75], method="higher")
+    found = [float(q) if math.isfinite(q) else None for q in quartiles]
+    return dict(zip(("median", "lower", "upper"), found, strict=True))
 
 
 def band(runs: list[Run], error: str, cost: str, grid: np.ndarray) -> np.ndarray:

@@ -229,7 +229,11 @@ def test_the_command_line_writes_results_pictures_and_table(monkeypatch, tmp_pat
     assert results["command"].startswith("python -m benchmarks run bowl")
     assert "not_able" in results["methods"]["mitsuba_ad"]
     levels = results["methods"]["halving"]
-    assert levels["parameter_error"]["levels"]["99"]["evaluations"] == [35, 35, 35]
+    assert levels["parameter_error"]["levels"]["99"]["evaluations"] == {
+        "median": 35,
+        "lower": 35,
+        "upper": 35,
+    }
     assert levels["parameter_error"]["levels"]["99"]["solved"] == 2
     for picture in ("error-vs-time.png", "error-vs-evaluations.png", "images.png"):
         assert (folder / picture).read_bytes().startswith(b"\x89PNG")

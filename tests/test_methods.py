@@ -36,7 +36,7 @@ EXPECTED = {
     "our_h": (2000, 0.5, 4 * 2 + 2 * (4 * 2 + 4 * 3) + 4 * 2),
     "our_hvp": (2000, 0.3, 4 * 2 + 2 * (4 * 2 + 2 * 4 * 2) + 4 * 2),
     "our_hvpa": (2000, 0.3, 12 + 3 * (12 + 2 * 12) + 12),
-    # without safeguards it need not converge, and does not here: only bounds and counts are asked of it
+    # without safeguards it need not converge: only bounds and counts are asked of it
     "newton": (500, math.inf, 4 * 2 + 4 * 3),
     "newton_modified": (2000, 0.5, 4 * 2 + 4 * 3),
     "bfgs": (2000, 0.1, 4 * 2),

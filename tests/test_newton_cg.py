@@ -437,12 +437,16 @@ def test_points_stay_within_bounds_and_within_reach(dtype):
     for center in (jnp.zeros(3, dtype), jnp.asarray([0.1, -0.5, 0], dtype)):
         for matrix in (turn, turn * np.array([1, 1e-3, 1])):
             metric = Metric(*(jnp.asarray(a, dtype) for a in (matrix, np.linalg.inv(matrix))))
-            place = jax.vmap(functools.partial(metric.bounded, center, low=low, high=high))
-            points = place(moves)
-            assert np.all((points >= low[None]) & (points <= high[None]))
-            reach = jnp.linalg.norm(metric.into(points - center[None]), axis=1)
-            assert np.all(reach <= 1.101 * jnp.linalg.norm(moves, axis=1))
+            for mirror in (False, True):
+                bounded = functools.partial(metric.bounded, low=low, high=high, mirror=mirror)
+                points = jax.vmap(bounded, in_axes=(None, 0))(center, moves)
+                assert np.all((points >= low[None]) & (points <= high[None]))
+                reach = jnp.linalg.norm(metric.into(points - center[None]), axis=1)
+                assert np.all(reach <= 1.101 * jnp.linalg.norm(moves, axis=1))
+                # a step never turns round; of the samples in a narrow valley some do
+                turned = jnp.any((points - center[None]) * metric.out(moves) < -1e-6)
+                assert mirror or not turned
         plain = Metric.of(jnp.asarray([0.5, 1, 2], dtype), adapted=False)
-        place = jax.vmap(functools.partial(plain.bounded, center, low=low, high=high))
+        place = jax.vmap(functools.partial(plain.bounded, center, low=low, high=high, mirror=True))
         clamped = jnp.clip(center[None] + plain.out(moves), low[None], high[None])
         np.testing.assert_array_equal(place(moves), clamped)

@@ -2,6 +2,7 @@
 
 import abc
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -10,6 +11,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from smoothdiff._params import as_key
+
+# optax and norms mix dtypes (Adam raises a float to an integer), whatever the user's setting
+promotion = partial(jax.numpy_dtype_promotion, "standard")
 
 
 class Progress(eqx.Module):
@@ -97,6 +101,12 @@ def read_options(options: dict[str, Any]) -> tuple[Array, tuple[PyTree, PyTree] 
             'options={"key": jax.random.key(0)} to optimistix, or key= to sd.minimise'
         )
     return as_key(options["key"]), options.get("bounds")
+
+
+def sigma_at(sigma: PyTree, step: Int[Array, ""]) -> PyTree:
+    """The smoothing width of a step: an optax schedule is asked, anything else is what it is."""
+    with promotion():
+        return sigma(step) if callable(sigma) else sigma
 
 
 def project(y: PyTree[Array], bounds: tuple[PyTree, PyTree] | None) -> PyTree[Array]:

@@ -54,13 +54,18 @@ class Metric(eqx.Module):
         return jnp.max(self.matrix)
 
     def bounded(
-        self, center: Float[Array, " n"], u: Float[Array, " n"], low: Array, high: Array
+        self,
+        center: Float[Array, " n"],
+        u: Float[Array, " n"],
+        low: Float[Array, " n"],
+        high: Float[Array, " n"],
+        mirror: bool,
     ) -> Float[Array, " n"]:
         """The point `center` + M u, or what the bounds leave of it.
 
         Clamped entry by entry if that brings it no farther from the center. In a narrow valley it
-        does, by far: there the point is pulled back along its ray, or along the opposite one if
-        that has more room.
+        does, by far: there the point is pulled back along its ray. A sample, not a step, may take
+        the opposite ray instead (`mirror`) where that has more room.
         """
         move = self.out(u)
         clamped = jnp.clip(center + move, low, high)
@@ -70,9 +75,12 @@ class Metric(eqx.Module):
             room = jnp.where(move > 0, high - center, low - center)
             return jnp.min(jnp.where(move != 0, room / jnp.where(move != 0, move, 1), jnp.inf))
 
-        forth, back = share(move), share(-move)
-        ray = jnp.where(back > forth, -move, move) * jnp.minimum(jnp.maximum(forth, back), 1)
-        return jnp.where(near, clamped, jnp.clip(center + ray, low, high))
+        forth = share(move)
+        if mirror:
+            back = share(-move)
+            move = jnp.where(back > forth, -move, move)
+            forth = jnp.maximum(forth, back)
+        return jnp.where(near, clamped, jnp.clip(center + jnp.minimum(forth, 1) * move, low, high))
 
     def slope(self, grad: Float[Array, " n"]) -> Float[Array, " n"]:
         """The gradient in the parameters from that in units of the width."""

@@ -1,7 +1,6 @@
 """First order: any optax transformation, driven by the gradient of the smoothed function."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Literal
 
 import equinox as eqx
@@ -22,15 +21,15 @@ from smoothdiff._solvers._base import (
     all_finite,
     judge,
     project,
+    promotion,
     read_options,
+    sigma_at,
 )
 
 # so many small updates in a row count as convergence: under noise a single one is luck
 _PATIENCE = 5
 # the share of the newest iterate in the running average
 _NEWEST = 0.1
-# optax and norms mix dtypes (Adam raises a float to an integer), whatever the user's setting
-_promotion = partial(jax.numpy_dtype_promotion, "standard")
 
 
 class FirstOrderState(eqx.Module):
@@ -131,14 +130,10 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
         """A batch for each of the three candidates."""
         return 3 * self.num_samples
 
-    def _sigma_at(self, step: Int[Array, ""]) -> PyTree:
-        with _promotion():
-            return self.sigma(step) if callable(self.sigma) else self.sigma
-
     def _estimator(self, fn, args, step, options) -> Callable:
         """`y -> value, (stderr, aux)`, differentiable, with the key and the sigma of a step."""
         key, bounds = read_options(options)
-        sigma = self._sigma_at(step)
+        sigma = sigma_at(self.sigma, step)
 
         def estimate(y):
             # one pair or frame alone has no standard error, but it does have a gradient
@@ -167,7 +162,7 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
         """Checks what can be looked at; evaluates nothing."""
         _, bounds = read_options(options)
         step = jnp.asarray(0, jnp.int32)
-        take_apart(y, self._sigma_at(step), bounds)
+        take_apart(y, sigma_at(self.sigma, step), bounds)
         return FirstOrderState(Progress.start(y, f_struct.dtype), self.optim.init(y), y, step)
 
     def step(self, fn, y, args, options, state, tags):
@@ -176,7 +171,7 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
         estimate = self._estimator(fn, args, progress.step, options)
         (fun, (stderr, aux)), grad = jax.value_and_grad(estimate, has_aux=True)(y)
         optim = optax.with_extra_args_support(self.optim)
-        with _promotion():
+        with promotion():
             updates, opt_state = optim.update(grad, state.opt_state, y, value=fun, grad=grad)
             new_y = optax.apply_updates(y, updates)
         new_y = project(new_y, read_options(options)[1])
@@ -184,7 +179,7 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
         average = jax.tree.map(
             lambda a, new: a + share.astype(a.dtype) * (new - a), state.average, new_y
         )
-        with _promotion():
+        with promotion():
             moved, size = self.norm(jax.tree.map(jnp.subtract, new_y, y)), self.norm(y)
             quiet = jnp.where(moved < self.atol + self.rtol * size, state.quiet + 1, 0)
         finite = all_finite((fun, grad, new_y))
@@ -194,7 +189,7 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
             (new_y, opt_state, average),
             (y, state.opt_state, state.average),
         )
-        sigma = self._sigma_at(progress.step)
+        sigma = sigma_at(self.sigma, progress.step)
         progress = progress.after(y, fun, stderr, sigma, self.num_samples, finite)
         # the function was never evaluated at y itself, so its aux is that of a sample near y
         aux = jax.tree.map(lambda a: a[0], aux)

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from functools import partial
 from typing import Literal
 
 import equinox as eqx
@@ -19,9 +18,11 @@ from smoothdiff._solvers._base import (
     Progress,
     all_finite,
     judge,
+    promotion,
     read_options,
+    sigma_at,
 )
-from smoothdiff._solvers._regression import gauss_newton_step
+from smoothdiff._solvers._parameter_regression import gauss_newton_step
 
 # the longest step of any parameter, in units of its sigma: beyond it nothing has been seen
 _LONGEST = 2.0
@@ -31,7 +32,6 @@ _SHRINK, _GROW = 0.25, 1.5
 _WIDEST = 2.0
 # so many small steps in a row count as convergence
 _PATIENCE = 3
-_promotion = partial(jax.numpy_dtype_promotion, "standard")
 
 
 class GaussNewtonState(eqx.Module):
@@ -155,9 +155,7 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         return 2 * self.evaluations_per_step(y)
 
     def _params(self, y: PyTree, step: Int[Array, ""], options: dict) -> Params:
-        with _promotion():
-            sigma = self.sigma(step) if callable(self.sigma) else self.sigma
-        params = take_apart(y, sigma, read_options(options)[1])
+        params = take_apart(y, sigma_at(self.sigma, step), read_options(options)[1])
         if params.free:
             raise ValueError("GaussNewton needs a sigma for every leaf of the parameters, not None")
         return params
@@ -241,7 +239,7 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             scale = jnp.where(same, 2 * scale, jnp.minimum(wanted * scale, _WIDEST))
 
         new_y = params.layout.tree(theta)
-        with _promotion():
+        with promotion():
             moved = self.norm(params.layout.tree(jnp.abs(theta - params.theta) + sigma))
             small = moved < self.atol + self.rtol * self.norm(y)
         quiet = jnp.where(small, state.quiet + 1, 0)

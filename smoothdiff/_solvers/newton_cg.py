@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from functools import partial
 from typing import Any, Literal
 
 import equinox as eqx
@@ -21,7 +20,9 @@ from smoothdiff._solvers._base import (
     Progress,
     all_finite,
     judge,
+    promotion,
     read_options,
+    sigma_at,
 )
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._noisy_step import Trust, outcome, propose, revise
@@ -30,8 +31,6 @@ from smoothdiff._stderr import value_stderr
 
 # the most entries of the points that are kept by default, 128 MB in float64
 _MEMORY = 2**24
-# optax and norms mix dtypes, whatever the user's setting
-_promotion = partial(jax.numpy_dtype_promotion, "standard")
 # how strongly the noise of the Hessian's eigenvalues counts in the metric
 _CAUTION = 6.0
 
@@ -129,6 +128,8 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         for name, value in (("num_samples", num_samples), ("history", history)):
             if value is not None and value < 2:
                 raise ValueError(f"{name} must be at least 2, or None for the default: {value}")
+        if nonfinite not in ("propagate", "drop"):
+            raise ValueError(f'nonfinite must be "propagate" or "drop", not {nonfinite!r}')
         self.sigma = sigma
         self.num_samples = num_samples
         self.history = history
@@ -143,12 +144,8 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     def _adaptive(self) -> bool:
         return not callable(self.sigma)
 
-    def _sigma_at(self, step: Int[Array, ""]) -> PyTree:
-        with _promotion():
-            return self.sigma(step) if callable(self.sigma) else self.sigma
-
     def _params(self, y: PyTree, step: Int[Array, ""], options: dict[str, Any]) -> Params:
-        params = take_apart(y, self._sigma_at(step), read_options(options)[1])
+        params = take_apart(y, sigma_at(self.sigma, step), read_options(options)[1])
         if params.free:
             raise ValueError("NewtonCG needs a sigma for every leaf: it has no other derivatives")
         return params
@@ -173,7 +170,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         unit = take_apart(jnp.zeros_like(params.theta), 1.0, None)
 
         def fun(u: Array, _: list) -> tuple[Array, PyTree]:
-            x = _bounded(params, metric, params.theta, u, width)
+            x = _bounded(params, metric, params.theta, u, width, mirror=True)
             return fn(params.layout.tree(x), args)
 
         batch = evaluate(
@@ -214,7 +211,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         metric = state.metric if self._adaptive else Metric.of(params.sigma, False)
         batch = self._batch(fn, y, args, params, metric, trust.width, progress.step, options)
         z = batch.draws.map(lambda z, _: z)
-        points = jax.vmap(lambda u: _bounded(params, metric, theta, u, trust.width))(z)
+        points = jax.vmap(lambda u: _bounded(params, metric, theta, u, trust.width, mirror=True))(z)
         fresh = jnp.isfinite(batch.values) if batch.valid is None else batch.valid
         kept = [
             jnp.concatenate([old[len(z) :], new.astype(old.dtype)])
@@ -239,7 +236,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         def confine(p: Array) -> Array:
             if held is None:
                 return p
-            x = _bounded(params, new_metric, base, p, trust.width)
+            x = _bounded(params, new_metric, base, p, trust.width, mirror=False)
             return new_metric.into(x - base) / trust.width
 
         step = propose(model, at, turn, trust.radius, hold, confine)
@@ -248,7 +245,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
             # to the last bit, or it would not be at its bound in the next step
             x = jnp.where(held, base, x)
         new_y = params.layout.tree(x)
-        with _promotion():
+        with promotion():
             length = self.norm(params.layout.tree(x - base))
             small = length < self.atol + self.rtol * self.norm(y)
         new_trust = revise(trust, step, good, ratio, small, self._adaptive)
@@ -309,11 +306,13 @@ def _adapted(metric: Metric, model: ScalarFit, at: Array) -> tuple[Metric, Metri
     return metric.adapted(model.curvature(at), model.curvature_diagonal(at), noise)
 
 
-def _bounded(params: Params, metric: Metric, base: Array, u: Array, width: Array) -> Array:
-    """The point u widths from `base`, within the bounds."""
+def _bounded(
+    params: Params, metric: Metric, base: Array, u: Array, width: Array, mirror: bool
+) -> Array:
+    """The point u widths from `base`, within the bounds if there are any."""
     if params.low is None or params.high is None:
         return base + metric.out(width * u)
-    return metric.bounded(base, width * u, params.low, params.high)
+    return metric.bounded(base, width * u, params.low, params.high, mirror)
 
 
 def _held(params: Params, x: Array, slope: Array, width: Array) -> Array | None:
