@@ -1,4 +1,4 @@
-"""NewtonCG and its parts: the inner solver, the metric, known optima, faults, how it runs."""
+"""NewtonCG: known optima, bounds, restarts, how it runs, faults, bad settings."""
 
 import functools
 from typing import Any
@@ -12,8 +12,7 @@ import pytest
 from closed_forms import Widened
 
 import smoothdiff as sd
-from smoothdiff._solvers._metric import MOST_DIRECTIONS, Metric
-from smoothdiff._solvers._trust_region import truncated_cg
+from smoothdiff._solvers._metric import MOST_DIRECTIONS
 
 KEY = jax.random.key(5)
 
@@ -222,7 +221,7 @@ def test_vmap_over_keys_is_a_loop_over_them(x64):
     def final(key):
         options = {"key": key}
         run = optx.minimise(quadratic, solver, y0, args[1], options, max_steps=3, throw=False)
-        return run.state.accepted
+        return run.state.search.accepted
 
     keys = jax.random.split(KEY, 3)
     many = jax.jit(jax.vmap(final))(keys)
@@ -255,6 +254,45 @@ def test_a_resumed_run_ends_with_the_same_bits(tmp_path):
     pick = lambda record: (record.step, record.evaluations, record.fun, record.stderr, record.sigma)
     assert list(map(pick, resumed.history)) == list(map(pick, whole.history))
     assert resumed.fun == whole.fun
+
+
+def two_wells(y, args):
+    """Of two wells the right one is a little deeper."""
+    left, right = (jnp.exp(-jnp.sum((y - jnp.array([x, 0.0])) ** 2)) for x in (-2, 2))
+    return 1 - 0.97 * left - right
+
+
+def test_restarts_find_the_deeper_of_two_wells():
+    y0 = jnp.zeros(2)
+    once, often = sd.NewtonCG(jnp.float32(1.0)), sd.NewtonCG(jnp.float32(1.0), restarts=5)
+    ends = []
+    for key in jax.random.split(KEY, 8):
+        one = sd.minimise(two_wells, y0, key=key, solver=once, max_steps=300)
+        assert one.reason != "max_steps"
+        ends.append(float(one.y[0]))
+        all_of_them = sd.minimise(two_wells, y0, key=key, solver=often, max_steps=600)
+        np.testing.assert_allclose(all_of_them.y, [2, 0], atol=0.02)
+        # until the first search ends nothing is different
+        same = len(one.history) - 1
+        for a, b in zip(one.history[:same], all_of_them.history, strict=False):
+            np.testing.assert_array_equal(a.y, b.y)
+        # the result is no worse for the search that was going on
+        assert all_of_them.fun < 0.01
+    # or the test would show nothing
+    assert min(ends) < 0
+
+
+def test_a_restart_begins_at_the_start_with_the_first_sigma():
+    fun = lambda y, args: jnp.sum(y**2)
+    solver = sd.NewtonCG(0.5, patience=3, restarts=2)
+    run = sd.minimise(fun, jnp.array([1.0, 2.0]), key=KEY, solver=solver, max_steps=500)
+    begun = [i for i, r in enumerate(run.history) if np.array_equal(r.y, [1, 2])]
+    assert len(begun) == 2
+    assert run.reason in ("converged", "noise")
+    for i in begun:
+        assert run.history[i + 1].sigma == 0.5
+        assert not np.array_equal(run.history[i + 1].y, run.history[0].y)
+    np.testing.assert_allclose(run.y, 0, atol=1e-3)
 
 
 def test_a_schedule_for_sigma_is_followed():
@@ -314,6 +352,11 @@ def test_too_few_samples_are_refused(name):
         sd.NewtonCG(**{"sigma": 0.1, name: 1})
 
 
+def test_negative_restarts_are_refused():
+    with pytest.raises(ValueError, match="restarts must be 0 or more"):
+        sd.NewtonCG(0.1, restarts=-1)
+
+
 @pytest.mark.parametrize(
     ("sigma", "settings", "match"),
     [
@@ -330,123 +373,3 @@ def test_bad_settings_are_refused(sigma, settings, match):
     fun = lambda y, args: jnp.sum(y["a"] ** 2) + jnp.sum(y["b"] ** 2)
     with pytest.raises(ValueError, match=match):
         sd.minimise(fun, y0, key=KEY, solver=sd.NewtonCG(sigma, **settings), max_steps=1)
-
-
-# the inner solver
-
-
-@jax.jit
-def within(hessian, grad, radius):
-    return truncated_cg(lambda v: hessian @ v, grad, radius)
-
-
-def symmetric(seed, eigenvalues):
-    rng = np.random.default_rng(seed)
-    turn = np.linalg.qr(rng.normal(size=(len(eigenvalues),) * 2))[0]
-    return turn * eigenvalues @ turn.T, rng.normal(size=len(eigenvalues))
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_inside_the_region_the_step_is_newtons(seed, dtype):
-    hessian, grad = symmetric(seed, [1.0, 3.0, 10.0, 40.0])
-    exact = -np.linalg.solve(hessian, grad)
-    radius = 2 * np.linalg.norm(exact)
-    step = within(*(jnp.asarray(a, dtype) for a in (hessian, grad, radius)))
-    size = float(jnp.finfo(dtype).eps) ** 0.5 * np.linalg.norm(grad)
-    np.testing.assert_allclose(step, exact, atol=2 * size)
-
-
-@pytest.mark.parametrize("eigenvalues", [(1, 3, 10, 40), (-1, 2, 5, 9), (-4, -3, -2, -1), (0,) * 4])
-@pytest.mark.parametrize("radius", [1e-3, 0.03, 1.0, 100.0])
-def test_the_step_is_no_worse_than_cauchys_and_reaches_the_boundary(eigenvalues, radius, x64):
-    for seed in range(5):
-        hessian, grad = symmetric(seed, np.array(eigenvalues, float))
-        step = np.asarray(within(*(jnp.asarray(a) for a in (hessian, grad, radius))))
-        model = lambda p, h=hessian, g=grad: g @ p + p @ h @ p / 2
-        bent, size = grad @ hessian @ grad, np.linalg.norm(grad)
-        share = min(1, size**3 / (radius * bent)) if bent > 0 else 1
-        assert model(step) <= model(-share * radius / size * grad) * (1 - 1e-12)
-        length = np.linalg.norm(step)
-        assert length <= radius * (1 + 1e-9)
-        newton = np.linalg.norm(np.linalg.pinv(hessian) @ grad)
-        if min(eigenvalues) <= 0 or newton > radius:
-            assert length == pytest.approx(radius)
-
-
-def test_without_a_gradient_there_is_no_step(dtype):
-    hessian, _ = symmetric(0, [-1.0, 2.0, 5.0, 9.0])
-    step = within(jnp.asarray(hessian, dtype), jnp.zeros(4, dtype), jnp.ones((), dtype))
-    np.testing.assert_array_equal(step, 0)
-
-
-# the metric
-
-
-def settled(hessian, metric):
-    """The metric after many steps on one Hessian, without noise."""
-
-    @jax.jit
-    def advance(metric):
-        product = lambda v: jnp.matmul(metric.matrix.T, hessian @ (metric.matrix @ v))
-        whole = metric.matrix.T @ hessian @ metric.matrix
-        return metric.adapted(product, jnp.diagonal(whole), jnp.zeros(()))[0]
-
-    for _ in range(60):
-        metric = advance(metric)
-    return metric
-
-
-def test_widths_follow_the_hessian_to_its_inverse_root(x64):
-    hessian = jnp.asarray(symmetric(0, np.array([0.1, 1.0, 30.0]))[0])
-    metric = settled(hessian, Metric.of(jnp.array([0.5, 1.0, 2.0]), adapted=True))
-    round_ = metric.matrix.T @ hessian @ metric.matrix
-    np.testing.assert_allclose(round_ / round_[0, 0], np.eye(3), atol=1e-3)
-    assert jnp.linalg.det(metric.matrix) == pytest.approx(1)
-    points = jnp.asarray(np.random.default_rng(0).normal(size=(4, 3)))
-    np.testing.assert_allclose(metric.into(metric.out(points)), points, rtol=1e-9)
-    np.testing.assert_allclose(metric.out(metric.into(points[0])), points[0], rtol=1e-9)
-
-
-def test_many_widths_follow_the_diagonal(x64):
-    sizes = jnp.asarray(np.geomspace(0.1, 10, MOST_DIRECTIONS + 1))
-    start = metric = turn = Metric.of(jnp.full(sizes.size, 0.5), adapted=True)
-    assert metric.matrix.shape == sizes.shape
-    for _ in range(60):
-        bends = sizes * metric.matrix**2
-        metric, turn = metric.adapted(lambda v, b=bends: b * v, bends, jnp.zeros(()))
-    np.testing.assert_allclose(metric.matrix * jnp.sqrt(sizes), 0.5, rtol=1e-3)
-    assert jnp.sum(jnp.log(metric.matrix / start.matrix)) == pytest.approx(0, abs=1e-9)
-    np.testing.assert_allclose(metric.into(metric.out(sizes)), sizes, rtol=1e-9)
-    np.testing.assert_allclose(turn.out(turn.into(sizes)), sizes, rtol=1e-9)
-
-
-@pytest.mark.parametrize(("size", "noise"), [(0.0, 0.0), (1.0, 1e6)], ids=["flat", "noise"])
-def test_what_says_nothing_changes_nothing(size, noise, x64):
-    bends = size * jnp.array([1.0, 5.0, -2.0])
-    metric = Metric.of(jnp.array([0.5, 1.0, 2.0]), adapted=True)
-    after, turn = metric.adapted(lambda v: bends * v, bends, jnp.asarray(noise))
-    np.testing.assert_allclose(after.matrix, metric.matrix, atol=1e-5)
-    np.testing.assert_allclose(turn.matrix, np.eye(3), atol=1e-5)
-
-
-def test_points_stay_within_bounds_and_within_reach(dtype):
-    rng = np.random.default_rng(0)
-    turn, moves = rng.normal(size=(3, 3)), jnp.asarray(3 * rng.normal(size=(200, 3)), dtype)
-    low, high = jnp.asarray([-1, -0.5, -2], dtype), jnp.asarray([0.1, 0.6, np.inf], dtype)
-    # the first center is inside, the second in a corner
-    for center in (jnp.zeros(3, dtype), jnp.asarray([0.1, -0.5, 0], dtype)):
-        for matrix in (turn, turn * np.array([1, 1e-3, 1])):
-            metric = Metric(*(jnp.asarray(a, dtype) for a in (matrix, np.linalg.inv(matrix))))
-            for mirror in (False, True):
-                bounded = functools.partial(metric.bounded, low=low, high=high, mirror=mirror)
-                points = jax.vmap(bounded, in_axes=(None, 0))(center, moves)
-                assert np.all((points >= low[None]) & (points <= high[None]))
-                reach = jnp.linalg.norm(metric.into(points - center[None]), axis=1)
-                assert np.all(reach <= 1.101 * jnp.linalg.norm(moves, axis=1))
-                # a step never turns round; of the samples in a narrow valley some do
-                turned = jnp.any((points - center[None]) * metric.out(moves) < -1e-6)
-                assert mirror or not turned
-        plain = Metric.of(jnp.asarray([0.5, 1, 2], dtype), adapted=False)
-        place = jax.vmap(functools.partial(plain.bounded, center, low=low, high=high, mirror=True))
-        clamped = jnp.clip(center[None] + plain.out(moves), low[None], high[None])
-        np.testing.assert_array_equal(place(moves), clamped)

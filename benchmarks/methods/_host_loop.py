@@ -3,7 +3,11 @@
 from collections.abc import Callable
 from typing import Any
 
+import jax
+import numpy as np
+
 from benchmarks._task import Solve, Task, Y
+from smoothdiff import Record
 
 
 def run_by(minimise: Callable, task: Task, fun: Callable[[Y], Any], solver: Any) -> Solve:
@@ -13,6 +17,7 @@ def run_by(minimise: Callable, task: Task, fun: Callable[[Y], Any], solver: Any)
         return fun(y)
 
     def solve(y0, key, record):
+        best = _Best(y0)
         result = minimise(
             with_args,
             y0,
@@ -20,10 +25,29 @@ def run_by(minimise: Callable, task: Task, fun: Callable[[Y], Any], solver: Any)
             solver=solver,
             max_evaluations=task.budget.evaluations,
             bounds=task.bounds,
-            callback=lambda step: record(step.y),
+            callback=lambda step: record(best.after(step)),
         )
         if result.reason == "interrupted":
             raise KeyboardInterrupt
         record(result.y)
 
     return solve
+
+
+class _Best:
+    """What is shown of a run with restarts, which begin at y0.
+
+    A search that follows another one is hidden until it has seen something better.
+    """
+
+    def __init__(self, y0: Y):
+        self._y0, self._shown, self._lowest = jax.device_get(y0), y0, np.inf
+        self._target = np.inf
+
+    def after(self, step: Record) -> Y:
+        if jax.tree.all(jax.tree.map(np.array_equal, step.y, self._y0)):
+            self._target = self._lowest
+        self._lowest = min(self._lowest, step.fun)
+        if step.fun < self._target:
+            self._target, self._shown = np.inf, step.y
+        return self._shown

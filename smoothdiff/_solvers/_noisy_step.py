@@ -29,13 +29,15 @@ class Trust(eqx.Module):
     """How far the model is believed.
 
     `width` is that of the samples relative to sigma, `radius` that of the trust region in widths,
-    `promised` the decrease that the model expected of the last step. `quiet` counts the steps in a
-    row that led nowhere, and `blind` says that the last gradient was all noise.
+    `promised` the decrease that the model expected of the last step. `lowest` is the lowest value
+    so far, `quiet` counts the steps in a row that led nowhere, and `blind` says that the last
+    gradient was all noise.
     """
 
     width: Float[Array, ""]
     radius: Float[Array, ""]
     promised: Float[Array, ""]
+    lowest: Float[Array, ""]
     quiet: Int[Array, ""]
     blind: Bool[Array, ""]
 
@@ -44,7 +46,7 @@ class Trust(eqx.Module):
         """As wide as sigma: samples reach as far as the square root of n widths."""
         one = jnp.ones((), dtype)
         none = jnp.zeros((), jnp.int32)
-        return Trust(one, math.sqrt(n) * one, 0 * one, none, jnp.asarray(False))
+        return Trust(one, math.sqrt(n) * one, 0 * one, jnp.inf * one, none, jnp.asarray(False))
 
 
 class Step(NamedTuple):
@@ -140,6 +142,7 @@ def revise(
     step: Step,
     good: Bool[Array, ""],
     ratio: Float[Array, ""],
+    value: Float[Array, ""],
     small: Bool[Array, ""],
     adaptive: bool,
 ) -> Trust:
@@ -147,7 +150,8 @@ def revise(
 
     The width goes to the length of the Newton step, or to its noise if that is more: where samples
     are too few to tell, narrower ones would tell even less. Where all is noise it grows, and where
-    the function is flat it grows beyond sigma.
+    the function is flat it grows beyond sigma. A step has led somewhere if the `value` where it
+    started is the lowest so far, unless the next one is blind or `small`.
     """
     most = math.sqrt(step.p.size)
     length = jnp.linalg.norm(step.p)
@@ -168,6 +172,7 @@ def revise(
         width=width * factor,
         radius=jnp.minimum(radius, _MOST * most),
         promised=step.promised,
-        quiet=jnp.where(step.blind | small, trust.quiet + 1, 0),
+        lowest=jnp.minimum(trust.lowest, value),
+        quiet=jnp.where(step.blind | small | (value >= trust.lowest), trust.quiet + 1, 0),
         blind=step.blind,
     )

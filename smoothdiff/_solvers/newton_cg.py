@@ -25,26 +25,25 @@ from smoothdiff._solvers._base import (
     sigma_at,
 )
 from smoothdiff._solvers._metric import Metric
-from smoothdiff._solvers._noisy_step import Trust, outcome, propose, revise
+from smoothdiff._solvers._noisy_step import outcome, propose, revise
 from smoothdiff._solvers._scalar_fit import ScalarFit, fit
+from smoothdiff._solvers._search import Restarts, Search
 from smoothdiff._stderr import value_stderr
 
 # the most entries of the points that are kept by default, 128 MB in float64
 _MEMORY = 2**24
+# the fewest samples that are kept by default: with few parameters more pay than the curvature needs
+_FEWEST = 40
 # how strongly the noise of the Hessian's eigenvalues counts in the metric
 _CAUTION = 6.0
 
 
 class NewtonCGState(eqx.Module):
-    """The state of `NewtonCG`: the last point that was accepted, and the samples that are kept."""
+    """The state of `NewtonCG`."""
 
     progress: Progress
-    accepted: Float[Array, " n"]
-    points: Float[Array, "m n"]
-    values: Float[Array, " m"]
-    valid: Bool[Array, " m"]
-    metric: Metric
-    trust: Trust
+    search: Search
+    restarts: Restarts | None
 
 
 class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
@@ -75,16 +74,19 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
             parameters to begin with; or an optax schedule, a function from the number of the step
             to a number, that is followed.
         num_samples: evaluations a step; by default 4 + 3 log n for n parameters.
-        history: how many samples are kept, by default (n + 1)(n + 2), but at most 512, and less
+        history: how many samples are kept, by default (n + 1)(n + 2), but from 40 to 512, and less
             where they would take more than 128 MB.
         sampler: where to sample, one whose points are normal.
         nonfinite: "propagate" a sample that is NaN or infinite, which ends the run with an error,
             or "drop" it.
-        rtol: relative tolerance. The run has converged when `patience` steps in a row are below
-            `atol + rtol * norm(y)`, or the gradient below its noise.
+        rtol: relative tolerance: a step is small if it is below `atol + rtol * norm(y)`.
         atol: absolute tolerance.
         norm: the norm of steps and iterates.
-        patience: how many steps in a row that lead nowhere end the run.
+        patience: how many steps in a row that lead nowhere end the search: the estimate is not the
+            lowest so far, or the gradient is all noise, or the step is small.
+        restarts: how many searches may follow, each from the first point and with the first sigma,
+            but with other random numbers: for functions with several minima. The best point of all
+            is returned.
 
     Example:
         >>> import jax, jax.numpy as jnp, optimistix as optx, smoothdiff as sd
@@ -111,6 +113,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     atol: float
     norm: Callable[[PyTree], Float[Array, ""]]
     patience: int
+    restarts: int
 
     def __init__(
         self,
@@ -123,11 +126,14 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         rtol: float = 0.0,
         atol: float = 0.0,
         norm: Callable[[PyTree], Float[Array, ""]] = optx.max_norm,
-        patience: int = 50,
+        patience: int = 30,
+        restarts: int = 0,
     ):
         for name, value in (("num_samples", num_samples), ("history", history)):
             if value is not None and value < 2:
                 raise ValueError(f"{name} must be at least 2, or None for the default: {value}")
+        if restarts < 0:
+            raise ValueError(f"restarts must be 0 or more: {restarts}")
         if nonfinite not in ("propagate", "drop"):
             raise ValueError(f'nonfinite must be "propagate" or "drop", not {nonfinite!r}')
         self.sigma = sigma
@@ -139,6 +145,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         self.atol = atol
         self.norm = norm
         self.patience = patience
+        self.restarts = restarts
 
     @property
     def _adaptive(self) -> bool:
@@ -149,6 +156,10 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         if params.free:
             raise ValueError("NewtonCG needs a sigma for every leaf: it has no other derivatives")
         return params
+
+    def _metric(self, metric: Metric, params: Params) -> Metric:
+        """That of the search, unless a schedule says how wide to sample."""
+        return metric if self._adaptive else Metric.of(params.sigma, False)
 
     def evaluations_per_step(self, y: PyTree[Array]) -> int:
         """One batch."""
@@ -162,7 +173,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         return 3 * self.evaluations_per_step(y)
 
     def _kept(self, y: PyTree[Array], n: int) -> int:
-        usual = min((n + 1) * (n + 2), 512, max(_MEMORY // n, 64))
+        usual = min(max((n + 1) * (n + 2), _FEWEST), 512, max(_MEMORY // n, 64))
         return max(usual if self.history is None else self.history, self.evaluations_per_step(y))
 
     def _batch(self, fn, y, args, params: Params, metric: Metric, width, step, options) -> Batch:
@@ -191,41 +202,30 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         """Checks what can be looked at; evaluates nothing."""
         step = jnp.asarray(0, jnp.int32)
         params = self._params(y, step, options)
-        theta, n = params.theta, params.theta.size
-        kept = self._kept(y, n)
-        return NewtonCGState(
-            progress=Progress.start(y, f_struct.dtype),
-            accepted=theta,
-            points=jnp.broadcast_to(theta, (kept, n)),
-            values=jnp.zeros(kept, theta.dtype),
-            valid=jnp.zeros(kept, bool),
-            metric=Metric.of(params.sigma, self._adaptive),
-            trust=Trust.start(n, theta.dtype),
-        )
+        theta, metric = params.theta, Metric.of(params.sigma, self._adaptive)
+        search = Search.start(theta, metric, self._kept(y, theta.size))
+        restarts = None
+        if self.restarts:
+            left = jnp.asarray(self.restarts, jnp.int32)
+            restarts = Restarts(left, theta, metric, search.trust.width)
+        return NewtonCGState(Progress.start(y, f_struct.dtype), search, restarts)
 
     def step(self, fn, y, args, options, state, tags):
         """One batch, one Newton step from all samples that are kept."""
-        progress, trust = state.progress, state.trust
+        progress, search, trust = state.progress, state.search, state.search.trust
         params = self._params(y, progress.step, options)
         theta = params.theta
-        metric = state.metric if self._adaptive else Metric.of(params.sigma, False)
+        metric = self._metric(search.metric, params)
         batch = self._batch(fn, y, args, params, metric, trust.width, progress.step, options)
         z = batch.draws.map(lambda z, _: z)
         points = jax.vmap(lambda u: _bounded(params, metric, theta, u, trust.width, mirror=True))(z)
         fresh = jnp.isfinite(batch.values) if batch.valid is None else batch.valid
-        kept = [
-            jnp.concatenate([old[len(z) :], new.astype(old.dtype)])
-            for old, new in (
-                (state.points, points),
-                (state.values, batch.values),
-                (state.valid, fresh),
-            )
-        ]
-        model = fit(metric.into(kept[0] - theta[None]) / trust.width, kept[1], kept[2])
+        kept = search.keeping(points, batch.values, fresh)
+        model = fit(metric.into(kept.points - theta[None]) / trust.width, kept.values, kept.valid)
 
-        before = metric.into(state.accepted - theta) / trust.width
+        before = metric.into(search.accepted - theta) / trust.width
         good, ratio = outcome(model, before, trust.promised)
-        at, base = jnp.where(good, 0, before), jnp.where(good, theta, state.accepted)
+        at, base = jnp.where(good, 0, before), jnp.where(good, theta, search.accepted)
         new_metric, turn = (
             _adapted(metric, model, at) if self._adaptive else (metric, metric.unit())
         )
@@ -248,50 +248,63 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         with promotion():
             length = self.norm(params.layout.tree(x - base))
             small = length < self.atol + self.rtol * self.norm(y)
-        new_trust = revise(trust, step, good, ratio, small, self._adaptive)
+        here = jnp.zeros_like(at)
+        value = model.value(here)
+        new_trust = revise(trust, step, good, ratio, value, small, self._adaptive)
         finite = all_finite((batch.values if batch.valid is None else batch.scale, x))
         # a failed step leaves everything as it was
-        new, old = (
-            (new_y, base, *kept, new_metric, new_trust),
-            ((y, state.accepted, state.points, state.values, state.valid, state.metric, trust)),
+        new_y, new_search = jax.tree.map(
+            lambda a, b: jnp.where(finite, a, b),
+            (new_y, kept.moved(base, new_metric, new_trust)),
+            (y, search),
         )
-        new_y, *rest = jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, old)
         progress = progress.after(
             y,
-            model.value(jnp.zeros_like(at)),
-            model.value_stderr(jnp.zeros_like(at)),
+            value,
+            model.value_stderr(here),
             trust.width * metric.widest(),
             len(z),
             finite,
         )
+        restarts = state.restarts
+        if restarts is not None:
+            lowest = progress.best_fun < state.progress.best_fun
+            restarts = restarts.after(lowest, metric, trust.width)
+            first = Metric.of(params.sigma, self._adaptive)
+            again, new_search, restarts = restarts.next(new_search, first, self.patience)
+            new_y = jax.tree.map(
+                lambda a, b: jnp.where(again, a, b), params.layout.tree(restarts.theta), new_y
+            )
         # the function was never evaluated at y itself, so its aux is that of a sample near y
         aux = jax.tree.map(lambda a: a[0], batch.aux)
-        return new_y, NewtonCGState(progress, *rest), aux
+        return new_y, NewtonCGState(progress, new_search, restarts), aux
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """After `patience` steps in a row that led nowhere, or a failed step."""
         finite = state.progress.finite
         result = optx.RESULTS.where(finite, optx.RESULTS.successful, optx.RESULTS.nonfinite)
-        return (state.trust.quiet >= self.patience) | ~finite, result
+        return state.search.done(self.patience) | ~finite, result
 
     def reason(self, state: NewtonCGState) -> str:
         """Small steps, or a gradient that is all noise however many samples there are."""
-        return "noise" if state.trust.blind else "converged"
+        return "noise" if state.search.trust.blind else "converged"
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         """Judges the last point, the last accepted and the best recorded on fresh samples."""
-        progress = state.progress
+        progress, search = state.progress, state.search
+        # with restarts, on the width on which the lowest estimate was made
+        wide = search.trust.width if state.restarts is None else state.restarts.width
+        turned = search.metric if state.restarts is None else state.restarts.metric
 
         def estimate(y):
             params = self._params(y, progress.step, options)
-            metric = state.metric if self._adaptive else Metric.of(params.sigma, False)
-            width = state.trust.width
-            batch = self._batch(fn, y, args, params, metric, width, progress.step, options)
+            metric = self._metric(turned, params)
+            batch = self._batch(fn, y, args, params, metric, wide, progress.step, options)
             value = combine(batch, jnp.zeros_like(params.theta))
             return value, value_stderr(batch, value)
 
         params = self._params(y, progress.step, options)
-        accepted = params.layout.tree(state.accepted)
+        accepted = params.layout.tree(search.accepted)
         y, fun, stderr = judge(estimate, y, accepted, progress.best_y)
         evaluations = progress.evaluations + self.final_evaluations(y)
         return y, aux, {"fun": fun, "stderr": stderr, "evaluations": evaluations}

@@ -1,0 +1,83 @@
+"""One search of Newton-CG, from a start to where it leads nowhere, and starting another one."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from smoothdiff._solvers._metric import Metric
+from smoothdiff._solvers._noisy_step import Trust
+
+
+class Search(eqx.Module):
+    """Where a search stands: the last accepted point, the samples that are kept, the trust."""
+
+    accepted: Float[Array, " n"]
+    points: Float[Array, "m n"]
+    values: Float[Array, " m"]
+    valid: Bool[Array, " m"]
+    metric: Metric
+    trust: Trust
+
+    @staticmethod
+    def start(theta: Float[Array, " n"], metric: Metric, kept: int) -> "Search":
+        """Nothing is known, and the samples are as wide as sigma."""
+        return Search(
+            accepted=theta,
+            points=jnp.broadcast_to(theta, (kept, theta.size)),
+            values=jnp.zeros(kept, theta.dtype),
+            valid=jnp.zeros(kept, bool),
+            metric=metric,
+            trust=Trust.start(theta.size, theta.dtype),
+        )
+
+    def keeping(
+        self, points: Float[Array, "k n"], values: Float[Array, " k"], valid: Bool[Array, " k"]
+    ) -> "Search":
+        """With new samples instead of the oldest."""
+        kept = (
+            jnp.concatenate([old[len(new) :], new.astype(old.dtype)])
+            for old, new in ((self.points, points), (self.values, values), (self.valid, valid))
+        )
+        return Search(self.accepted, *kept, metric=self.metric, trust=self.trust)
+
+    def moved(self, accepted: Float[Array, " n"], metric: Metric, trust: Trust) -> "Search":
+        """The same samples, seen from elsewhere."""
+        return Search(accepted, self.points, self.values, self.valid, metric, trust)
+
+    def done(self, patience: int) -> Bool[Array, ""]:
+        """Whether so many steps in a row led nowhere."""
+        return self.trust.quiet >= patience
+
+
+class Restarts(eqx.Module):
+    """How many searches may still follow, where they begin, and what the best one saw.
+
+    Searches that have just begun are wide. So that they are not compared with the end of others on
+    that width, `metric` and `width` are those of the lowest estimate so far.
+    """
+
+    left: Int[Array, ""]
+    theta: Float[Array, " n"]
+    metric: Metric
+    width: Float[Array, ""]
+
+    def after(self, lowest: Bool[Array, ""], metric: Metric, width: Float[Array, ""]) -> "Restarts":
+        """Remembers how wide the batch was, if its estimate is the lowest so far."""
+        kernel = jax.tree.map(
+            lambda a, b: jnp.where(lowest, a, b), (metric, width), (self.metric, self.width)
+        )
+        return Restarts(self.left, self.theta, *kernel)
+
+    def next(
+        self, search: Search, metric: Metric, patience: int
+    ) -> tuple[Bool[Array, ""], Search, "Restarts"]:
+        """Whether the search is over and another one begins, the search that goes on, what is left.
+
+        `metric` is that of the first sigma.
+        """
+        again = search.done(patience) & (self.left > 0)
+        first = Search.start(self.theta, metric, len(search.valid))
+        search = jax.tree.map(lambda a, b: jnp.where(again, a, b), first, search)
+        left = self.left - again.astype(self.left.dtype)
+        return again, search, Restarts(left, self.theta, self.metric, self.width)

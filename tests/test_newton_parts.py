@@ -1,0 +1,130 @@
+"""What Newton-CG is made of: the inner solver, the metric with its bounds."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from smoothdiff._solvers._metric import MOST_DIRECTIONS, Metric
+from smoothdiff._solvers._trust_region import truncated_cg
+
+# the inner solver
+
+
+@jax.jit
+def within(hessian, grad, radius):
+    return truncated_cg(lambda v: hessian @ v, grad, radius)
+
+
+def symmetric(seed, eigenvalues):
+    rng = np.random.default_rng(seed)
+    turn = np.linalg.qr(rng.normal(size=(len(eigenvalues),) * 2))[0]
+    return turn * eigenvalues @ turn.T, rng.normal(size=len(eigenvalues))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_inside_the_region_the_step_is_newtons(seed, dtype):
+    hessian, grad = symmetric(seed, [1.0, 3.0, 10.0, 40.0])
+    exact = -np.linalg.solve(hessian, grad)
+    radius = 2 * np.linalg.norm(exact)
+    step = within(*(jnp.asarray(a, dtype) for a in (hessian, grad, radius)))
+    size = float(jnp.finfo(dtype).eps) ** 0.5 * np.linalg.norm(grad)
+    np.testing.assert_allclose(step, exact, atol=2 * size)
+
+
+@pytest.mark.parametrize("eigenvalues", [(1, 3, 10, 40), (-1, 2, 5, 9), (-4, -3, -2, -1), (0,) * 4])
+@pytest.mark.parametrize("radius", [1e-3, 0.03, 1.0, 100.0])
+def test_the_step_is_no_worse_than_cauchys_and_reaches_the_boundary(eigenvalues, radius, x64):
+    for seed in range(5):
+        hessian, grad = symmetric(seed, np.array(eigenvalues, float))
+        step = np.asarray(within(*(jnp.asarray(a) for a in (hessian, grad, radius))))
+        model = lambda p, h=hessian, g=grad: g @ p + p @ h @ p / 2
+        bent, size = grad @ hessian @ grad, np.linalg.norm(grad)
+        share = min(1, size**3 / (radius * bent)) if bent > 0 else 1
+        assert model(step) <= model(-share * radius / size * grad) * (1 - 1e-12)
+        length = np.linalg.norm(step)
+        assert length <= radius * (1 + 1e-9)
+        newton = np.linalg.norm(np.linalg.pinv(hessian) @ grad)
+        if min(eigenvalues) <= 0 or newton > radius:
+            assert length == pytest.approx(radius)
+
+
+def test_without_a_gradient_there_is_no_step(dtype):
+    hessian, _ = symmetric(0, [-1.0, 2.0, 5.0, 9.0])
+    step = within(jnp.asarray(hessian, dtype), jnp.zeros(4, dtype), jnp.ones((), dtype))
+    np.testing.assert_array_equal(step, 0)
+
+
+# the metric
+
+
+def settled(hessian, metric):
+    """The metric after many steps on one Hessian, without noise."""
+
+    @jax.jit
+    def advance(metric):
+        product = lambda v: jnp.matmul(metric.matrix.T, hessian @ (metric.matrix @ v))
+        whole = metric.matrix.T @ hessian @ metric.matrix
+        return metric.adapted(product, jnp.diagonal(whole), jnp.zeros(()))[0]
+
+    for _ in range(60):
+        metric = advance(metric)
+    return metric
+
+
+def test_widths_follow_the_hessian_to_its_inverse_root(x64):
+    hessian = jnp.asarray(symmetric(0, np.array([0.1, 1.0, 30.0]))[0])
+    metric = settled(hessian, Metric.of(jnp.array([0.5, 1.0, 2.0]), adapted=True))
+    round_ = metric.matrix.T @ hessian @ metric.matrix
+    np.testing.assert_allclose(round_ / round_[0, 0], np.eye(3), atol=1e-3)
+    assert jnp.linalg.det(metric.matrix) == pytest.approx(1)
+    points = jnp.asarray(np.random.default_rng(0).normal(size=(4, 3)))
+    np.testing.assert_allclose(metric.into(metric.out(points)), points, rtol=1e-9)
+    np.testing.assert_allclose(metric.out(metric.into(points[0])), points[0], rtol=1e-9)
+
+
+def test_many_widths_follow_the_diagonal(x64):
+    sizes = jnp.asarray(np.geomspace(0.1, 10, MOST_DIRECTIONS + 1))
+    start = metric = turn = Metric.of(jnp.full(sizes.size, 0.5), adapted=True)
+    assert metric.matrix.shape == sizes.shape
+    for _ in range(60):
+        bends = sizes * metric.matrix**2
+        metric, turn = metric.adapted(lambda v, b=bends: b * v, bends, jnp.zeros(()))
+    np.testing.assert_allclose(metric.matrix * jnp.sqrt(sizes), 0.5, rtol=1e-3)
+    assert jnp.sum(jnp.log(metric.matrix / start.matrix)) == pytest.approx(0, abs=1e-9)
+    np.testing.assert_allclose(metric.into(metric.out(sizes)), sizes, rtol=1e-9)
+    np.testing.assert_allclose(turn.out(turn.into(sizes)), sizes, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("size", "noise"), [(0.0, 0.0), (1.0, 1e6)], ids=["flat", "noise"])
+def test_what_says_nothing_changes_nothing(size, noise, x64):
+    bends = size * jnp.array([1.0, 5.0, -2.0])
+    metric = Metric.of(jnp.array([0.5, 1.0, 2.0]), adapted=True)
+    after, turn = metric.adapted(lambda v: bends * v, bends, jnp.asarray(noise))
+    np.testing.assert_allclose(after.matrix, metric.matrix, atol=1e-5)
+    np.testing.assert_allclose(turn.matrix, np.eye(3), atol=1e-5)
+
+
+def test_points_stay_within_bounds_and_within_reach(dtype):
+    rng = np.random.default_rng(0)
+    turn, moves = rng.normal(size=(3, 3)), jnp.asarray(3 * rng.normal(size=(200, 3)), dtype)
+    low, high = jnp.asarray([-1, -0.5, -2], dtype), jnp.asarray([0.1, 0.6, np.inf], dtype)
+    # the first center is inside, the second in a corner
+    for center in (jnp.zeros(3, dtype), jnp.asarray([0.1, -0.5, 0], dtype)):
+        for matrix in (turn, turn * np.array([1, 1e-3, 1])):
+            metric = Metric(*(jnp.asarray(a, dtype) for a in (matrix, np.linalg.inv(matrix))))
+            for mirror in (False, True):
+                bounded = functools.partial(metric.bounded, low=low, high=high, mirror=mirror)
+                points = jax.vmap(bounded, in_axes=(None, 0))(center, moves)
+                assert np.all((points >= low[None]) & (points <= high[None]))
+                reach = jnp.linalg.norm(metric.into(points - center[None]), axis=1)
+                assert np.all(reach <= 1.101 * jnp.linalg.norm(moves, axis=1))
+                # a step never turns round; of the samples in a narrow valley some do
+                turned = jnp.any((points - center[None]) * metric.out(moves) < -1e-6)
+                assert mirror or not turned
+        plain = Metric.of(jnp.asarray([0.5, 1, 2], dtype), adapted=False)
+        place = jax.vmap(functools.partial(plain.bounded, center, low=low, high=high, mirror=True))
+        clamped = jnp.clip(center[None] + plain.out(moves), low[None], high[None])
+        np.testing.assert_array_equal(place(moves), clamped)
