@@ -22,6 +22,7 @@ from tqdm import tqdm
 
 from benchmarks._task import Budget, Loss, Method, NativeAD, NotAble, Solve, Task, Y, precision_of
 
+CLOSED = 1e-8  # the smallest gap that is scored
 GROWTH = 1.1  # a trace keeps a point when the evaluations have grown by this factor
 WARM_UP_SEED = 1_000_003  # a start that is not in any ensemble
 WARM_UP_ITERATIONS = 3
@@ -29,8 +30,8 @@ WARM_UP_ITERATIONS = 3
 Run = dict[str, Any]
 
 
-class BudgetSpent(Exception):
-    """Raised by `record` to stop a method."""
+class Stop(Exception):
+    """Raised by `record` to stop a method; says what ended the run."""
 
 
 class Counter:
@@ -72,18 +73,27 @@ class Counter:
 class Recorder:
     """Stamps each y with the evaluations and seconds so far, and ends the run in time.
 
-    Of the points it keeps about 25 for each factor of ten in evaluations, and always the last.
+    Of the points it keeps about 25 for each factor of ten in evaluations, and always the last. A
+    run ends early where `gap(y)` is at the last level: nothing would be scored after it.
     """
 
-    def __init__(self, counter: Counter, budget: Budget, y0: Y, iterations: float = np.inf):
+    def __init__(
+        self,
+        counter: Counter,
+        budget: Budget,
+        y0: Y,
+        iterations: float = np.inf,
+        gap: Callable[[Y], float] | None = None,
+    ):
         self._counter, self._budget, self._iterations = counter, budget, iterations
+        self._gap = gap
         self.trace = [(0, 0.0, _flat(y0))]
         self._last = self.trace[0]
         counter.evaluations = 0
         self._began = time.perf_counter()
 
     def __call__(self, y: Y) -> None:
-        """Takes the y of an iteration; raises BudgetSpent after the last one."""
+        """Takes the y of an iteration; raises Stop after the last one."""
         flat = _flat(y)  # waits for the evaluations behind y
         evaluations = self._counter.evaluations
         seconds = time.perf_counter() - self._began
@@ -93,7 +103,12 @@ class Recorder:
         self._iterations -= 1
         spent = evaluations >= self._budget.evaluations or seconds >= self._budget.seconds
         if spent or self._iterations <= 0:
-            raise BudgetSpent
+            raise Stop("by the budget")
+        if self._gap is not None:
+            solved = self._gap(y) <= CLOSED
+            self._began += time.perf_counter() - self._began - seconds  # that was not the method's
+            if solved:
+                raise Stop("at the optimum")
 
     def finish(self) -> list[tuple[int, float, np.ndarray]]:
         """The points kept, with the last one."""
@@ -183,23 +198,32 @@ def _warm_up(task: Task, method: Method, counter: Counter) -> tuple[Solve, float
     return solve, time.perf_counter() - began
 
 
-def _record(task: Task, solve: Solve, seed: int, counter: Counter, iterations: float = np.inf):
+def _record(
+    task: Task,
+    solve: Solve,
+    seed: int,
+    counter: Counter,
+    iterations: float = np.inf,
+    gap: Callable[[Y], float] | None = None,
+) -> tuple[list[tuple[int, float, np.ndarray]], str]:
     """The trace of a run, and why it ended."""
     if task.choose is not None:
         task.choose(seed)
     y0 = task.start(seed)
-    recorder = Recorder(counter, task.budget, y0, iterations)
+    recorder = Recorder(counter, task.budget, y0, iterations, gap)
     ended = "by the method"
     try:
         solve(y0, jax.random.key(seed), recorder)
-    except BudgetSpent:
-        ended = "by the budget"
+    except Stop as stop:
+        ended = str(stop)
     return recorder.finish(), ended
 
 
 def _solve(task: Task, solve: Solve, seed: int, counter: Counter, exact_loss: Loss) -> Run:
     """One run with its scores. Errors are relative to those of the start, except for the gap."""
-    trace, ended = _record(task, solve, seed, counter)
+    lowest = task.optimum
+    above = None if lowest is None else lambda y: float(exact_loss(y)) - lowest
+    trace, ended = _record(task, solve, seed, counter, gap=above)
     _, unravel = ravel_pytree(task.reference)
     evaluations, seconds, ys = zip(*trace, strict=True)
     gap = np.array([float(exact_loss(unravel(y))) for y in ys]) - (task.optimum or 0.0)

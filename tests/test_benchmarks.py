@@ -156,6 +156,16 @@ def test_the_budget_ends_a_run(bowl, tmp_path):
         assert run["ended"] == "by the budget"
 
 
+def test_a_run_ends_at_the_optimum(bowl, tmp_path):
+    lowest = float(bowl.loss(bowl.reference))
+    scaled = lambda y: 1e-6 * (bowl.loss(y) - lowest)
+    task = dataclasses.replace(bowl, loss=scaled, exact_loss=scaled, optimum=0.0)
+    for run in harness(task, HALVING, tmp_path):
+        assert run["gap"][-1] <= 1e-8 < run["gap"][-2]
+        assert run["ended"] == "at the optimum"
+        assert run["evaluations"][-1] == 5 * (len(run["gap"]) - 1) < 50
+
+
 def test_long_traces_are_thinned_and_keep_their_end(bowl):
     counter = _harness.Counter()
     recorder = _harness.Recorder(counter, Budget(10**6, 60), bowl.start(0))

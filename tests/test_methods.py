@@ -111,11 +111,11 @@ def test_progress_bounds_and_counts(name):
 def test_double_precision(name):
     def record(y):
         assert {leaf.dtype for leaf in jax.tree.leaves(y)} == {np.dtype("float64")}
-        raise _harness.BudgetSpent
+        raise _harness.Stop("by the budget")
 
     with precision_of(dataclasses.replace(bowl()[0], precision="float64")):
         task, seen = bowl()
-        with pytest.raises(_harness.BudgetSpent):
+        with pytest.raises(_harness.Stop, match="budget"):
             methods.load(name).prepare(task)(task.start(0), jax.random.key(0), record)
     assert seen[0].dtype == np.float64
 
