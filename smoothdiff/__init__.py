@@ -1,13 +1,15 @@
 """Gradients, Hessians and Hessian-vector products of functions that AD cannot differentiate."""
 
-from smoothdiff import kernels
+from smoothdiff import filters, kernels
 from smoothdiff._aggregate import Aggregate
 from smoothdiff._baselines import AbstractBaseline
 from smoothdiff._black_box import black_box
 from smoothdiff._call import Options
+from smoothdiff._filtered_adam import filter_updates, filtered_adam, scale_by_filtered_adam
 from smoothdiff._gp import GaussianProcess
 from smoothdiff._host_calls import BlackBoxError
 from smoothdiff._importance import Importance, difference_hvp
+from smoothdiff._large_steps import large_steps
 from smoothdiff._least_squares import LeastSquares
 from smoothdiff._minimise import MinimiseError, Record, Result, least_squares, minimise
 from smoothdiff._quadratic import HessianOperator, QuadraticModel
@@ -45,12 +47,17 @@ __all__ = [
     "Uniform",
     "black_box",
     "difference_hvp",
+    "filter_updates",
+    "filtered_adam",
+    "filters",
     "kernels",
+    "large_steps",
     "least_squares",
     "local_support",
     "matrix_support",
     "minimise",
     "probe_support",
+    "scale_by_filtered_adam",
     "smooth",
     "smooth_grad",
     "smooth_hessian",
