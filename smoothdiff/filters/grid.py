@@ -80,24 +80,27 @@ def cross_bilateral(
         raise ValueError(f"sigma_s={sigma_s} must be positive, in pixels; jnp.inf is a box")
 
     def filter(signal: Float[Array, "..."], guide: Float[Array, "..."]) -> Float[Array, "..."]:
-        planes, edges = _planes(signal, ndim), _planes(guide, ndim)
-        if planes.shape[1:] != edges.shape[1:]:
+        for array in (signal, guide):
+            _check_axes(array, ndim)
+        if signal.shape[:ndim] != guide.shape[:ndim]:
             raise ValueError(
                 f"signal {signal.shape} and guide {guide.shape} must have the same {ndim} leading "
                 "axes, which are space"
             )
-        dtype = edges.dtype
-        if log:
-            edges = jnp.log(jnp.maximum(jnp.abs(edges), jnp.finfo(dtype).tiny))
+        if not signal.size:
+            return signal
+        dtype = guide.dtype
+        edges = jnp.log(jnp.maximum(jnp.abs(guide), jnp.finfo(dtype).tiny)) if log else guide
         distance, spatial = jnp.asarray(sigma_d, dtype), jnp.asarray(sigma_s, dtype)
         # halved, no difference overflows; kept from the largest number, which means outside
         edges = jnp.clip(edges / 2, -_largest(dtype) / 4, _largest(dtype) / 4)
         tiny, large = jnp.finfo(dtype).tiny, _largest(dtype) / (2 * _longest(dtype))
         inverse = 2 * math.log2(math.e) / jnp.clip(distance, tiny, large)
         room = jnp.where((distance >= 0) & (spatial > 0), jnp.asarray(_ROOM, dtype), jnp.nan)
+        planes, guides = _planes(signal, ndim), _planes(edges, ndim)
         for level in range(levels):
-            planes = _smooth(planes, edges, inverse, spatial, room, 2**level)
-        return jnp.moveaxis(planes, 0, -1).reshape(signal.shape)
+            planes = _smooth(planes, guides, inverse, spatial, room, 2**level)
+        return jnp.stack(planes, axis=-1).reshape(signal.shape)
 
     return filter
 
@@ -180,17 +183,16 @@ def laplacian(lam: Scale, *, ndim: int, power: int | float = 1) -> Filter:
         raise ValueError(f"power={power} must be positive")
 
     def filter(signal: Float[Array, "..."], guide: Float[Array, "..."]) -> Float[Array, "..."]:
-        planes = _planes(signal, ndim)
-        space, dtype = planes.shape[1:], planes.dtype
+        _check_axes(signal, ndim)
+        space, dtype = signal.shape[:ndim], signal.dtype
         # sums over all pixels could overflow, and so could the reciprocal of the largest number
-        planes = planes / 4
-        size = jax.lax.stop_gradient(jnp.max(jnp.abs(planes), initial=jnp.finfo(dtype).tiny))
-        axes = range(1, ndim + 1)
-        waves = jax.scipy.fft.dctn(planes / size, axes=axes, norm="ortho")
+        scaled = signal / 4
+        size = jax.lax.stop_gradient(jnp.max(jnp.abs(scaled), initial=jnp.finfo(dtype).tiny))
+        waves = jax.scipy.fft.dctn(scaled / size, axes=range(ndim), norm="ortho")
         rates = sum(np.ix_(*(2 - 2 * np.cos(np.pi * np.arange(n) / n) for n in space)))
-        gain = (1 + jnp.asarray(lam, dtype) * jnp.asarray(rates, dtype)[None]) ** -power
-        smooth = jax.scipy.fft.idctn(waves * gain, axes=axes, norm="ortho") * size * 4
-        return jnp.moveaxis(smooth, 0, -1).reshape(signal.shape)
+        rates = jnp.asarray(rates, dtype).reshape(*space, *(1,) * (signal.ndim - ndim))
+        gain = (1 + jnp.asarray(lam, dtype) * rates) ** -power
+        return jax.scipy.fft.idctn(waves * gain, axes=range(ndim), norm="ortho") * size * 4
 
     return filter
 
@@ -202,12 +204,19 @@ def _check_ndim(ndim: int) -> None:
         )
 
 
-def _planes(x: Array, ndim: int) -> Array:
-    """The channels first: their innermost loop would be too short to be fast."""
+def _check_axes(x: Array, ndim: int) -> None:
     if x.ndim < ndim:
         raise ValueError(f"an array of shape {x.shape} has fewer than ndim={ndim} axes of space")
+
+
+def _planes(x: Array, ndim: int) -> list[Array]:
+    """The channels, each an array of its own.
+
+    In one array XLA keeps them innermost on a CPU, in loops too short to be fast: ten times slower.
+    """
     space = x.shape[:ndim]
-    return jnp.moveaxis(x.reshape(*space, math.prod(x.shape[ndim:])), -1, 0)
+    channels = x.reshape(*space, math.prod(x.shape[ndim:]))
+    return [channels[..., c] for c in range(channels.shape[-1])]
 
 
 def _largest(dtype: np.dtype) -> float:
@@ -215,47 +224,57 @@ def _largest(dtype: np.dtype) -> float:
 
 
 def _smooth(
-    signal: Array, guide: Array, inverse: Array, sigma_s: Array, room: Array, step: int
-) -> Array:
-    """One pass of `cross_bilateral` with taps `step` apart, on (channels, *space).
+    signals: list[Array],
+    guides: list[Array],
+    inverse: Array,
+    sigma_s: Array,
+    room: Array,
+    step: int,
+) -> list[Array]:
+    """One pass of `cross_bilateral` with taps `step` apart.
 
     Everything but the padding is one expression, which XLA compiles to one loop over the pixels.
     """
-    space = guide.shape[1:]
+    space = guides[0].shape
     # an axis with fewer pixels than a step has no taps
     reach = [step if step < n else 0 for n in space]
-    widths = [(0, 0), *((r, r) for r in reach)]
-    signal_around = jnp.pad(signal, widths)
+    signals_around = [jnp.pad(x, [(r, r) for r in reach]) for x in signals]
     # what is outside is as different as can be, and gets no weight
-    guide_around = jnp.pad(guide, widths, constant_values=_largest(guide.dtype) / 2)
-    total = room.astype(signal.dtype) * signal
-    weights = jnp.broadcast_to(room, (1, *space)).astype(signal.dtype)
+    outside = _largest(guides[0].dtype) / 2
+    guides_around = [jnp.pad(x, [(r, r) for r in reach], constant_values=outside) for x in guides]
+    dtype = signals[0].dtype
+    totals = [room.astype(dtype) * x for x in signals]
+    weights = jnp.broadcast_to(room, space).astype(dtype)
     for tap in itertools.product(*((-1, 0, 1) if r else (0,) for r in reach)):
         if any(tap):
-            start = [0, *(r + k * r for k, r in zip(tap, reach, strict=True))]
-            there = _distance(_window(guide_around, start, space), guide, inverse)
+            start = [r + k * r for k, r in zip(tap, reach, strict=True)]
+            there = _distance([_window(x, start, space) for x in guides_around], guides, inverse)
             near = room * jnp.exp(-math.hypot(*tap) / sigma_s)
-            weight = (near * _decay(there)).astype(signal.dtype)
-            total += weight * _window(signal_around, start, space)
+            weight = (near * _decay(there)).astype(dtype)
             weights += weight
-    return total / weights
+            totals = [
+                total + weight * _window(x, start, space)
+                for total, x in zip(totals, signals_around, strict=True)
+            ]
+    return [total / weights for total in totals]
 
 
 def _window(x: Array, start: list[int], space: tuple[int, ...]) -> Array:
-    stop = [x.shape[0], *(i + n for i, n in zip(start[1:], space, strict=True))]
-    return jax.lax.slice(x, start, stop)
+    return jax.lax.slice(x, start, [i + n for i, n in zip(start, space, strict=True)])
 
 
-def _distance(a: Array, b: Array, inverse: Array) -> Array:
-    """The scaled norm of the difference over channels, (1, *space)."""
+def _distance(there: list[Array], here: list[Array], inverse: Array) -> Array:
+    """The scaled norm of the difference over channels."""
     # beyond twice what has any weight nothing matters, but squares and derivatives would overflow
-    difference = jnp.minimum(jnp.abs(a - b), 2 * _longest(a.dtype) / inverse) * inverse
+    most = 2 * _longest(inverse.dtype) / inverse
+    difference = [
+        jnp.minimum(jnp.abs(a - b), most) * inverse for a, b in zip(there, here, strict=True)
+    ]
     if len(difference) == 1:
-        return difference
-    # added one by one, since a reduction would be a loop of its own inside that over the pixels
+        return difference[0]
     square = sum((d**2 for d in difference[1:]), difference[0] ** 2)
     # the square root has no derivative at zero
-    return jnp.sqrt(jnp.maximum(square, jnp.finfo(a.dtype).tiny))[None]
+    return jnp.sqrt(jnp.maximum(square, jnp.finfo(inverse.dtype).tiny))
 
 
 def _longest(dtype: np.dtype) -> float:
