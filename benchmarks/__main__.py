@@ -1,4 +1,4 @@
-"""The command line: `python -m benchmarks list | run TASK... | overhead | variance | stress`."""
+"""The command line: `python -m benchmarks list | run TASK... | overhead | filters | ...`."""
 
 import argparse
 import json
@@ -27,6 +27,7 @@ def main(arguments: list[str] | None = None, results: Path = RESULTS) -> None:
     run.add_argument("--methods", metavar="A,B", help="these, separated by commas")
     run.add_argument("--fresh", action="store_true", help="run again what has been run")
     commands.add_parser("overhead", help="derivatives against evaluating at the same points")
+    commands.add_parser("filters", help="time of filters against moving their bytes")
     errors = commands.add_parser("variance", help="errors of derivatives, for what they cost")
     errors.add_argument("--full", action="store_true", help="every estimator and problem")
     errors.add_argument("--fresh", action="store_true", help="measure again, as the code changed")
@@ -48,6 +49,10 @@ def main(arguments: list[str] | None = None, results: Path = RESULTS) -> None:
         from benchmarks import stress
 
         stress.main(results / "stress")
+    elif options.command == "filters":
+        from benchmarks import filters
+
+        filters.main(results / "filters")
     else:
         from benchmarks import overhead
 
@@ -67,10 +72,14 @@ def _list() -> None:
 
 
 def _run(name: str, options: argparse.Namespace, folder: Path, command: str) -> None:
-    from benchmarks import _family, _report
+    from benchmarks import _family, _report, descents
 
     module = tasks.module(name)
     built = module.build(options.full)
+    first = built[0] if isinstance(built, list) else built
+    if isinstance(first, descents.Descent):
+        descents.run(built, options, folder, command)
+        return
     console = Console()
     if isinstance(built, list):
         members = [_run_task(task, options, folder / task.name, command) for task in built]

@@ -97,7 +97,7 @@ def _images(task: Task, results: dict[str, Any], path: Path) -> None:
             notes = [f"{run['image_error'][-1]:.2g}" for run in runs]
             names = ["Start", *(found["title"] for found in methods.values()), "Reference"]
             for axis, y, name, note in zip(line, shown, names, ["1", *notes, "0"], strict=True):
-                axis.imshow(_display(task.image(y)), interpolation="nearest")
+                axis.imshow(display(task.image(y)), interpolation="nearest")
                 axis.set(xticks=[], yticks=[], xlabel=f"error {note}")
                 axis.spines[:].set_visible(False)
                 if seed == 0:
@@ -105,7 +105,7 @@ def _images(task: Task, results: dict[str, Any], path: Path) -> None:
             line[0].set_ylabel(f"start {seed}")
 
 
-def _display(image) -> np.ndarray:
+def display(image) -> np.ndarray:
     """Linear RGB as a screen shows it."""
     linear = np.clip(np.asarray(image), 0, 1)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
@@ -139,7 +139,7 @@ def _took(results: dict[str, Any], error: str) -> Table:
                 "" if i else found["title"],
                 level + unit,
                 f"{reached['solved']}/{found['starts']}",
-                *(_show(reached[cost]) for cost in COSTS),
+                *(show(reached[cost]) for cost in COSTS),
             )
         shown.add_section()
     return shown
@@ -156,13 +156,13 @@ def _left(results: dict[str, Any]) -> Table:
     for column in ("image error", "parameter error", "distance", "compile"):
         shown.add_column(column, justify="right")
     for found in able(results).values():
-        errors = [_show(found[error]["final"]) for error in ("image_error", "parameter_error")]
+        errors = [show(found[error]["final"]) for error in ("image_error", "parameter_error")]
         compiling = f"{found['warm_up_seconds']:.1f} s"
-        shown.add_row(found["title"], *errors, _show(found["distance"]), compiling)
+        shown.add_row(found["title"], *errors, show(found["distance"]), compiling)
     return shown
 
 
-def _show(quartiles: dict[str, float | None]) -> str:
+def show(quartiles: dict[str, float | None]) -> str:
     low, middle, high = (
         "-" if q is None else f"{q:.2g}" if q < 10 else f"{q:.0f}"
         for q in (quartiles[name] for name in ("lower", "median", "upper"))

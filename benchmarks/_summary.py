@@ -55,10 +55,10 @@ def _of_method(runs: list[Run]) -> dict[str, Any]:
     return {
         "starts": len(runs),
         "warm_up_seconds": runs[0]["warm_up_seconds"],
-        "distance": _quartiles([run["distance"] for run in runs]),
+        "distance": quartiles([run["distance"] for run in runs]),
         **{
             error: {
-                "final": _quartiles([run[error][-1] for run in runs]),
+                "final": quartiles([run[error][-1] for run in runs]),
                 "levels": {
                     name: _level(runs, error, level) for name, level in LEVELS[error].items()
                 },
@@ -73,7 +73,7 @@ def _of_method(runs: list[Run]) -> dict[str, Any]:
 def _level(runs: list[Run], error: str, level: float) -> dict[str, Any]:
     costs = {cost: [cost_to_level(run[error], run[cost], level) for run in runs] for cost in COSTS}
     solved = sum(math.isfinite(cost) for cost in costs["evaluations"])
-    return {"solved": solved} | {cost: _quartiles(values) for cost, values in costs.items()}
+    return {"solved": solved} | {cost: quartiles(values) for cost, values in costs.items()}
 
 
 def cost_to_level(errors: Sequence[float], costs: Sequence[float], level: float) -> float:
@@ -81,14 +81,14 @@ def cost_to_level(errors: Sequence[float], costs: Sequence[float], level: float)
     return next((c for e, c in zip(errors, costs, strict=True) if e <= level), math.inf)
 
 
-def _quartiles(values: Sequence[float]) -> dict[str, float | None]:
+def quartiles(values: Sequence[float]) -> dict[str, float | None]:
     """Median, lower and upper quartile; None stands for infinity, which JSON lacks.
 
     By name: in a list the first is easily taken for the median.
     """
     # "higher" takes values as they are: between a number and infinity there is no mean
-    quartiles = np.quantile(values, [0.5, 0.25, 0.75], method="higher")
-    found = [float(q) if math.isfinite(q) else None for q in quartiles]
+    three = np.quantile(values, [0.5, 0.25, 0.75], method="higher")
+    found = [float(q) if math.isfinite(q) else None for q in three]
     return dict(zip(("median", "lower", "upper"), found, strict=True))
 
 

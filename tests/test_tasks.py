@@ -16,7 +16,7 @@ def built(name, full=False) -> list[Task]:
     return found if isinstance(found, list) else [found]
 
 
-HERE = [task for name in tasks.TASKS if name != "shadow" for task in built(name)]
+HERE = [task for name in tasks.BLACK_BOXES if name != "shadow" for task in built(name)]
 BY_NAME = {task.name: task for task in HERE}
 WITH_RESIDUALS = [task.name for task in HERE if task.residuals is not None]
 PLATEAUS = ("box2", "box10", "box10-occluding", "rocket")

@@ -1,13 +1,14 @@
 """The tasks. Each is a module with TITLE and `build(full)`, imported when it is asked for.
 
 `build` gives a Task, or a list of them where one name stands for a family, such as a function in
-several dimensions; they are named "function-5d". To add one, write the module and name it here.
+several dimensions; they are named "function-5d". Problems that come with gradients are Descents
+instead, one or several. To add one, write the module and name it here.
 """
 
 import importlib
 from types import ModuleType
 
-TASKS = {
+BLACK_BOXES = {
     "shadow": "benchmarks.tasks.shadow",
     "quad": "benchmarks.tasks.quad",
     "box2": "benchmarks.tasks.box2",
@@ -20,6 +21,15 @@ TASKS = {
     "ellipsoid": "benchmarks.tasks.ellipsoid",
     "bbob": "benchmarks.tasks.bbob",
 }
+DESCENTS = {
+    "aniso": "benchmarks.tasks.aniso",
+    "noisy": "benchmarks.tasks.noisy",
+    "texture": "benchmarks.tasks.plate",
+    "volume": "benchmarks.tasks.volume",
+    "mesh-cube": "benchmarks.tasks.mesh_cube",
+    "mesh-horns": "benchmarks.tasks.mesh_horns",
+}
+TASKS = BLACK_BOXES | DESCENTS
 
 
 def module(name: str) -> ModuleType:
