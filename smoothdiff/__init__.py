@@ -1,6 +1,6 @@
 """Gradients, Hessians and Hessian-vector products of functions that AD cannot differentiate."""
 
-from smoothdiff import filters, kernels
+from smoothdiff import filters, kernels, surrogates
 from smoothdiff._aggregate import Aggregate
 from smoothdiff._baselines import AbstractBaseline
 from smoothdiff._black_box import black_box
@@ -19,6 +19,7 @@ from smoothdiff._smooth_second import smooth_hessian, smooth_hvp, smooth_quadrat
 from smoothdiff._solvers.first_order import FirstOrder
 from smoothdiff._solvers.gauss_newton import GaussNewton
 from smoothdiff._solvers.newton_cg import NewtonCG
+from smoothdiff._solvers.zerograds import ZeroGrads
 from smoothdiff._support import local_support, matrix_support, probe_support
 
 __version__ = "0.1.0"
@@ -45,6 +46,7 @@ __all__ = [
     "Result",
     "Sobol",
     "Uniform",
+    "ZeroGrads",
     "black_box",
     "difference_hvp",
     "filter_updates",
@@ -65,4 +67,5 @@ __all__ = [
     "smooth_jacobian",
     "smooth_quadratic",
     "smooth_value_and_grad",
+    "surrogates",
 ]

@@ -23,5 +23,13 @@ from smoothdiff._solvers._base import AbstractSmoothSolver, Progress
 from smoothdiff._solvers.first_order import FirstOrder
 from smoothdiff._solvers.gauss_newton import GaussNewton
 from smoothdiff._solvers.newton_cg import NewtonCG
+from smoothdiff._solvers.zerograds import ZeroGrads
 
-__all__ = ["AbstractSmoothSolver", "FirstOrder", "GaussNewton", "NewtonCG", "Progress"]
+__all__ = [
+    "AbstractSmoothSolver",
+    "FirstOrder",
+    "GaussNewton",
+    "NewtonCG",
+    "Progress",
+    "ZeroGrads",
+]

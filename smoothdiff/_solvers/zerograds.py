@@ -1,0 +1,383 @@
+"""ZeroGrads: gradient descent on a surrogate that is fitted to the function as it goes."""
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from smoothdiff._batch import Batch, evaluate
+from smoothdiff._estimate import combine
+from smoothdiff._named_baselines import as_baseline
+from smoothdiff._params import Params, is_concrete, take_apart
+from smoothdiff._samplers import AbstractSampler, Gaussian
+from smoothdiff._solvers._base import (
+    AbstractSmoothSolver,
+    Progress,
+    all_finite,
+    judge,
+    project,
+    promotion,
+    read_options,
+    sigma_at,
+)
+from smoothdiff._solvers._surrogate_fit import Fit
+from smoothdiff._stderr import value_stderr
+from smoothdiff.surrogates import MLP
+
+# the width of the smoothing kernel, in units of that of the locality
+_INNER = 0.15
+# the default rate of the parameters, in units of sigma
+_RATE = 0.02
+# so many small updates in a row count as convergence, as in FirstOrder
+_PATIENCE = 5
+# what the surrogate's key is made with: the number of no step
+_NO_STEP = 2**31 - 1
+
+
+class ZeroGradsState(eqx.Module):
+    """The state of `ZeroGrads`: the surrogate's and the optimiser's, and a count of small steps."""
+
+    progress: Progress
+    fit: Fit
+    opt_state: PyTree
+    quiet: Int[Array, ""]
+
+
+class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
+    r"""Gradient descent on a surrogate that learns the function near the parameters as it goes.
+
+    $$ \phi \leftarrow \text{optax}\Big(\nabla_\phi \tfrac1N \sum_i
+       \big(h_\phi(\rho_i) - f(\rho_i - \tau_i)\big)^2\Big), \qquad
+       y \leftarrow \Pi\big(\text{optax}(\nabla h_\phi(y))\big), $$
+
+    with $\rho \sim \mathcal{N}(y, \sigma^2)$, which keeps the surrogate h local, and $\tau \sim
+    \mathcal{N}(0, \sigma_i^2)$, which smooths the function that it sees. One batch of
+    `num_samples` evaluations a step serves all updates; the noise of a batch changes the weights of
+    the surrogate a little, and the gradient follows from all batches so far. The surrogate sees
+    points in units of sigma from the start, and values in units of their running mean deviation,
+    so a run does not depend on the scale of the function. The point returned is the better of the
+    last iterate and the one of lowest estimate, by a fresh batch each.
+
+    The defaults are the paper's but for `up_to_constant`, the rate of the parameters, the units,
+    and the network and `num_samples` in many dimensions. Its ablations are `inner_sigma=0`
+    (NoSmooth), `surrogate=smoothdiff.surrogates.Quadratic` (NoNN) and `local=False` (NoLocal).
+
+    Args:
+        sigma: the width of the neighbourhood in which the surrogate is fitted, the paper's outer
+            sigma, in the units of the parameters: a number, a pytree like the parameters, or an
+            optax schedule, a function from the number of the step to a number. The paper has 0.33
+            of the domain, 0.025 for the weights of networks and for textures.
+        surrogate: called as `surrogate(size, key=key)`, gives an `eqx.Module` that takes a vector
+            of `size` numbers and returns one: `surrogates.MLP`, or with other settings
+            `functools.partial(surrogates.MLP, width=32)`. Or a module that is already made.
+        inner_sigma: the width of the smoothing kernel, likewise; by default 15 % of sigma. It may
+            be zero.
+        num_samples: evaluations a step. The paper has 16 or 20 where there are many parameters;
+            many rough steps beat few good ones.
+        surrogate_steps: updates of the surrogate for each batch.
+        parameter_steps: updates of the parameters for each batch.
+        surrogate_optimizer: an optax transformation for the surrogate's weights.
+        optimizer: an optax transformation for the parameters. It may ask for `value`, `grad` and
+            `value_fn`, those of the surrogate in units of the first batch's mean deviation, so line
+            searches cost no evaluation. By default Adam with a rate of 2 % of sigma. Most of the
+            paper's are 0.3 % to 0.5 %: slower, and closer in the end.
+        up_to_constant: fit only how the values of a batch differ from one another, which is all
+            that a gradient needs; the paper fits the values themselves.
+        local: with False the surrogate is fitted to all that is within the bounds, uniformly.
+        log: fit the logarithm of the function, which must not be negative.
+        sampler: where to sample; a point is $(\rho, \tau)$ as one.
+        nonfinite: "propagate" or "drop" samples that are NaN or infinite, as for `smooth`.
+        rtol: relative tolerance. The run has converged when five updates in a row are below
+            `atol + rtol * norm(y)`.
+        atol: absolute tolerance. By default both are zero, and the run uses up its budget.
+        norm: the norm of updates and iterates.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, smoothdiff as sd
+        >>> plateaus = lambda y, args: jnp.sum(jnp.floor(4 * jnp.abs(y - 1)))
+        >>> result = sd.minimise(
+        ...     plateaus, jnp.zeros(2), key=jax.random.key(0), solver=sd.ZeroGrads(0.5),
+        ...     max_evaluations=1000,
+        ... )
+        >>> [round(float(y)) for y in result.y]
+        [1, 1]
+
+    Source: ZeroGrads: Learning Local Surrogates for Non-Differentiable Graphics (Fischer and
+    Ritschel), algorithms 1 and 2; the settings are those of its supplement.
+    """
+
+    sigma: PyTree
+    surrogate: Callable[..., Any]
+    inner_sigma: PyTree
+    num_samples: int
+    surrogate_steps: int
+    parameter_steps: int
+    surrogate_optimizer: optax.GradientTransformation
+    optimizer: optax.GradientTransformation | None
+    up_to_constant: bool
+    local: bool
+    log: bool
+    sampler: AbstractSampler
+    nonfinite: Literal["propagate", "drop"]
+    rtol: float
+    atol: float
+    norm: Callable[[PyTree], Float[Array, ""]]
+
+    def __init__(
+        self,
+        sigma: PyTree,
+        *,
+        surrogate: Callable[..., Any] = MLP,
+        inner_sigma: PyTree = None,
+        num_samples: int = 2,
+        surrogate_steps: int = 3,
+        parameter_steps: int = 1,
+        surrogate_optimizer: optax.GradientTransformation = optax.adam(1e-3),  # noqa: B008
+        optimizer: optax.GradientTransformation | None = None,
+        up_to_constant: bool = True,
+        local: bool = True,
+        log: bool = False,
+        sampler: AbstractSampler = Gaussian(antithetic=True),  # noqa: B008 (a frozen module)
+        nonfinite: Literal["propagate", "drop"] = "propagate",
+        rtol: float = 0.0,
+        atol: float = 0.0,
+        norm: Callable[[PyTree], Float[Array, ""]] = optx.max_norm,
+    ):
+        for name, optim in {
+            "surrogate_optimizer": surrogate_optimizer,
+            "optimizer": optax.identity() if optimizer is None else optimizer,
+        }.items():
+            if not isinstance(optim, optax.GradientTransformation):
+                raise TypeError(
+                    f"{name} must be an optax transformation such as optax.adam(1e-3): {optim}"
+                )
+        for name, steps in (("surrogate", surrogate_steps), ("parameter", parameter_steps)):
+            if steps < 1:
+                raise ValueError(f"{name}_steps must be at least 1, not {steps}")
+        if up_to_constant and num_samples == 1:
+            raise ValueError(
+                "one sample has no differences: use num_samples=2, or up_to_constant=False"
+            )
+        if not callable(surrogate):
+            raise TypeError(
+                "surrogate must be a class or function to be called as surrogate(size, key=key), "
+                f"such as smoothdiff.surrogates.MLP, or an eqx.Module, not {surrogate!r}"
+            )
+        self.sigma = sigma
+        self.surrogate = surrogate
+        self.inner_sigma = inner_sigma
+        self.num_samples = num_samples
+        self.surrogate_steps = surrogate_steps
+        self.parameter_steps = parameter_steps
+        self.surrogate_optimizer = surrogate_optimizer
+        self.optimizer = optimizer
+        self.up_to_constant = up_to_constant
+        self.local = local
+        self.log = log
+        self.sampler = sampler
+        self.nonfinite = nonfinite
+        self.rtol = rtol
+        self.atol = atol
+        self.norm = norm
+
+    def evaluations_per_step(self, y: PyTree[Array]) -> int:
+        """One batch."""
+        return self.num_samples
+
+    def final_evaluations(self, y: PyTree[Array]) -> int:
+        """A batch for each of the two candidates."""
+        return 2 * self.num_samples
+
+    def _params(self, y: PyTree, step: Int[Array, ""], options: dict[str, Any]) -> Params:
+        params = take_apart(y, sigma_at(self.sigma, step), read_options(options)[1])
+        if params.free:
+            raise ValueError("ZeroGrads needs a sigma for every leaf: it has no other derivatives")
+        return params
+
+    def _inner(self, params: Params, y: PyTree, step: Int[Array, ""]) -> Float[Array, " n"]:
+        """The width of the smoothing kernel."""
+        if self.inner_sigma is None:
+            return _INNER * params.sigma
+        return params.layout.vector(_per_leaf(sigma_at(self.inner_sigma, step), y))
+
+    def _make(self, params: Params, options: dict[str, Any]) -> tuple[PyTree, PyTree]:
+        """The surrogate before any fit: its weights, and the rest of it."""
+        surrogate = self.surrogate
+        if not isinstance(surrogate, eqx.Module):
+            key = jax.random.fold_in(read_options(options)[0], _NO_STEP)
+            surrogate = surrogate(params.theta.size, key=key)
+        weights, rest = eqx.partition(surrogate, eqx.is_inexact_array)
+        return jax.tree.map(lambda w: w.astype(params.theta.dtype), weights), rest
+
+    def _evaluated(self, fn, args, params: Params, size: int, place, step, options) -> Batch:
+        """One batch of the function at `place(z)`, of normal z of this size."""
+
+        def fun(z: Array, _: list) -> tuple[Array, PyTree]:
+            return fn(params.layout.tree(params.clip(place(z))), args)
+
+        batch = evaluate(
+            fun,
+            take_apart(jnp.zeros(size, params.theta.dtype), 1.0, None),
+            jax.random.fold_in(read_options(options)[0], step),
+            num_samples=self.num_samples,
+            sampler=self.sampler,
+            baseline=as_baseline("none"),
+            batch_size=None,
+            nonfinite=self.nonfinite,
+        )
+        if batch.log_ratio is not None:
+            raise ValueError(f"{self.sampler} has weights: ZeroGrads needs points that are normal")
+        return batch
+
+    def _sampled(self, fn, y, args, params: Params, step, options) -> tuple[Array, Batch]:
+        """Points rho around the parameters, with the function at rho - tau."""
+        inner = self._inner(params, y, step)
+
+        def place(z: Array) -> tuple[Array, Array]:
+            outer, tau = jnp.split(z, 2)
+            if self.local:
+                rho = params.theta + params.sigma * outer
+            else:
+                rho = _within(params, jax.scipy.special.ndtr(outer))
+            return rho, rho - inner * tau
+
+        size, at = 2 * params.theta.size, lambda z: place(z)[1]
+        batch = self._evaluated(fn, args, params, size, at, step, options)
+        return batch.draws.map(lambda z, _: jax.vmap(lambda z: place(z)[0])(z)), batch
+
+    def _mean(self, batch: Batch) -> tuple[Array, Array]:
+        """The mean of a batch and its standard error, which one pair alone does not have."""
+        value = combine(batch, jnp.zeros(batch.draws.n, batch.draws.dtype))
+        if batch.draws.num > self.sampler.group(batch.draws.num, batch.draws.n):
+            return value, value_stderr(batch, value)
+        return value, jnp.full_like(value, jnp.nan)
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> ZeroGradsState:
+        """Makes the surrogate and checks what can be looked at; evaluates nothing."""
+        step = jnp.asarray(0, jnp.int32)
+        params = self._params(y, step, options)
+        self._inner(params, y, step)
+        weights, _ = self._make(params, options)
+        fitting = self.surrogate_optimizer.init(weights)
+        fit = Fit.start(weights, fitting, params.theta, params.sigma, f_struct.dtype)
+        opt_state = self._descent().init(y)
+        return ZeroGradsState(Progress.start(y, f_struct.dtype), fit, opt_state, step)
+
+    def _descent(self) -> optax.GradientTransformationExtraArgs:
+        return optax.with_extra_args_support(self.optimizer or optax.adam(_RATE))
+
+    def step(self, fn, y, args, options, state, tags):
+        """One batch, updates of the surrogate on it, and of the parameters on the surrogate."""
+        progress = state.progress
+        params = self._params(y, progress.step, options)
+        rho, batch = self._sampled(fn, y, args, params, progress.step, options)
+        _, rest = self._make(params, options)
+        fit = state.fit.updated(
+            rest,
+            rho,
+            _log(batch.values) if self.log else batch.values,
+            _share(batch),
+            progress.step,
+            num_updates=self.surrogate_steps,
+            optimizer=self.surrogate_optimizer,
+            up_to_constant=self.up_to_constant,
+        )
+        new_y, opt_state = self._descended(fit, rest, params, y, state.opt_state, options)
+        with promotion():
+            moved, length = self.norm(jax.tree.map(jnp.subtract, new_y, y)), self.norm(y)
+            quiet = jnp.where(moved < self.atol + self.rtol * length, state.quiet + 1, 0)
+        finite = all_finite((fit.weights, fit.spread, new_y))
+        # a failed step leaves everything as it was, so that the iterate can still be used
+        new_y, fit, opt_state = jax.tree.map(
+            lambda new, old: jnp.where(finite, new, old),
+            (new_y, fit, opt_state),
+            (y, state.fit, state.opt_state),
+        )
+        fun, stderr = self._mean(batch)
+        sigma = sigma_at(self.sigma, progress.step)
+        progress = progress.after(y, fun, stderr, sigma, self.num_samples, finite)
+        # the function was never evaluated at y itself, so its aux is that of a sample near y
+        aux = jax.tree.map(lambda a: a[0], batch.aux)
+        return new_y, ZeroGradsState(progress, fit, opt_state, quiet), aux
+
+    def _descended(self, fit: Fit, rest: PyTree, params: Params, y, opt_state, options):
+        """Some updates of the parameters by the gradient of the surrogate."""
+        surrogate, optim = eqx.combine(fit.weights, rest), self._descent()
+        bounds = read_options(options)[1]
+        vector = lambda tree: params.layout.vector(jax.tree.leaves(tree))
+        height = lambda y: fit.height(surrogate, vector(y))
+
+        def update(carry, _):
+            y, opt_state = carry
+            value, grad = jax.value_and_grad(height)(y)
+            with promotion():
+                updates, opt_state = optim.update(
+                    grad, opt_state, y, value=value, grad=grad, value_fn=height
+                )
+                if self.optimizer is None:
+                    updates = params.layout.tree(vector(updates) * params.sigma)
+                return (project(optax.apply_updates(y, updates), bounds), opt_state), None
+
+        return jax.lax.scan(update, (y, opt_state), length=self.parameter_steps)[0]
+
+    def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
+        """After small updates in a row, or a failed step."""
+        finite = state.progress.finite
+        result = optx.RESULTS.where(finite, optx.RESULTS.successful, optx.RESULTS.nonfinite)
+        return (state.quiet >= _PATIENCE) | ~finite, result
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        """Judges the last iterate and the best recorded, smoothed by the inner kernel alone."""
+        progress = state.progress
+
+        def estimate(y):
+            params = self._params(y, progress.step, options)
+            inner = self._inner(params, y, progress.step)
+            place, size = (lambda z: params.theta - inner * z), params.theta.size
+            return self._mean(
+                self._evaluated(fn, args, params, size, place, progress.step, options)
+            )
+
+        y, fun, stderr = judge(estimate, y, progress.best_y)
+        evaluations = progress.evaluations + self.final_evaluations(y)
+        return y, aux, {"fun": fun, "stderr": stderr, "evaluations": evaluations}
+
+
+def _share(batch: Batch) -> Array:
+    """The weight of each sample in a mean over those that count."""
+    valid = 1 if batch.valid is None else batch.valid.astype(batch.scale.dtype)
+    return jnp.full(batch.draws.num, batch.scale) * valid
+
+
+def _log(values: Array) -> Array:
+    """The logarithm, finite at zero; NaN below."""
+    floor = jnp.finfo(values.dtype).tiny
+    return jnp.where(values < 0, jnp.nan, jnp.log(jnp.maximum(values, floor)))
+
+
+def _within(params: Params, share: Array) -> Array:
+    """The point at these shares of the way from the lower to the upper bounds."""
+    if params.low is None or params.high is None:
+        raise ValueError("local=False samples all that is within the bounds: give bounds")
+    return params.low + (params.high - params.low) * share
+
+
+def _per_leaf(width: PyTree, y: PyTree) -> list:
+    """One inner width for each leaf; zero is allowed, unlike for the locality."""
+    try:
+        widths = jax.tree.leaves(jax.tree.broadcast(width, y))
+    except ValueError as error:
+        raise ValueError(
+            "inner_sigma must be a number or a pytree with the structure of the parameters, "
+            f"{jax.tree.structure(y)}, not {jax.tree.structure(width)}"
+        ) from error
+    for w in filter(is_concrete, widths):
+        if not np.all((np.asarray(w) >= 0) & np.isfinite(w)):
+            raise ValueError(f"inner_sigma = {w} must be finite, and positive or zero")
+    return widths

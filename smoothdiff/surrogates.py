@@ -1,0 +1,96 @@
+r"""Surrogates for `ZeroGrads`: cheap differentiable functions that stand in for a black box.
+
+A surrogate is an `eqx.Module` that takes the parameters as one vector, in units of sigma and from
+the start of the run, and returns a number. `ZeroGrads` makes it by `surrogate(size, key=key)`.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+
+class MLP(eqx.Module):
+    r"""A fully connected network, optionally behind a positional encoding.
+
+    $$ h(u) = \text{net}(\gamma(u)), \qquad
+       \gamma(u) = (u, \sin 2^k u, \cos 2^k u)_{k = 0, \ldots, L - 1} $$
+
+    Args:
+        size: the number of parameters.
+        width: neurons in a hidden layer.
+        depth: hidden layers. The paper has three of 64 below 50 parameters, as here, and eight of
+            128 from there on, which took longer to learn anything.
+        activation: leaky ReLU is the paper's. Its second derivative is zero, so use a smooth one,
+            such as `jax.nn.gelu`, wherever the curvature of the surrogate is used.
+        frequencies: L, the octaves of a positional encoding, which the paper has from 50 parameters
+            on without a number.
+        key: draws the weights, uniform in plus and minus the root of one over a layer's inputs.
+
+    Example:
+        >>> import functools, jax, jax.numpy as jnp
+        >>> from smoothdiff.surrogates import MLP
+        >>> small = functools.partial(MLP, width=32, activation=jax.nn.gelu)  # for ZeroGrads
+        >>> small(10, key=jax.random.key(0))(jnp.zeros(10)).shape
+        ()
+
+    Source: ZeroGrads: Learning Local Surrogates for Non-Differentiable Graphics (Fischer and
+    Ritschel), supplement, section 1.
+    """
+
+    layers: eqx.nn.MLP
+    frequencies: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        size: int,
+        *,
+        width: int = 64,
+        depth: int = 3,
+        activation: Callable[[Array], Array] = jax.nn.leaky_relu,
+        frequencies: int = 0,
+        key: Key[Array, ""],
+    ):
+        inputs = size * (1 + 2 * frequencies)
+        self.layers = eqx.nn.MLP(inputs, "scalar", width, depth, activation, key=key)
+        self.frequencies = frequencies
+
+    def __call__(self, u: Float[Array, " n"]) -> Float[Array, ""]:
+        """The surrogate at one point."""
+        octaves = jnp.asarray(2.0 ** np.arange(self.frequencies), u.dtype)
+        waves = (octaves[:, None] * u[None]).reshape(-1)
+        return self.layers(jnp.concatenate([u, jnp.sin(waves), jnp.cos(waves)]))
+
+
+class Quadratic(eqx.Module):
+    r"""A quadratic potential, which has $n^2$ weights (the ablation NoNN).
+
+    $$ h(u) = (u, 1)^T M (u, 1) $$
+
+    Args:
+        size: the number of parameters, n.
+        key: not used: M starts as the identity.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> from smoothdiff.surrogates import Quadratic
+        >>> print(Quadratic(2, key=jax.random.key(0))(jnp.array([1.0, 2.0])))
+        6.0
+
+    Source: ZeroGrads (Fischer and Ritschel), section 4.1.
+    """
+
+    matrix: Float[Array, "m m"]
+
+    def __init__(self, size: int, *, key: Key[Array, ""]):
+        del key
+        self.matrix = jnp.eye(size + 1)
+
+    def __call__(self, u: Float[Array, " n"]) -> Float[Array, ""]:
+        """The surrogate at one point."""
+        # only the symmetric part of the matrix has an effect, so nothing needs to keep it symmetric
+        v = jnp.append(u, 1)
+        return jnp.vdot(v, self.matrix @ v)

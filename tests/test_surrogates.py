@@ -1,0 +1,56 @@
+"""Surrogates: their shapes, closed forms and initial weights."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from smoothdiff.surrogates import MLP, Quadratic
+
+KEY = jax.random.key(3)
+
+
+def weights(surrogate):
+    return jax.tree.leaves(eqx.filter(surrogate, eqx.is_array))
+
+
+@pytest.mark.parametrize("size", [1, 3, 60])
+@pytest.mark.parametrize("make", [MLP, Quadratic])
+def test_a_point_gives_one_number_and_a_gradient(make, size):
+    surrogate = make(size, key=KEY)
+    value, grad = jax.value_and_grad(surrogate)(jnp.linspace(0.1, 1, size))
+    assert value.shape == ()
+    assert grad.shape == (size,)
+    assert jnp.any(grad != 0)
+
+
+def test_the_positional_encoding_adds_octaves():
+    surrogate = MLP(3, width=5, depth=1, frequencies=2, key=KEY)
+    u = jnp.array([0.1, 0.2, 0.3])
+    features = jnp.concatenate([u, jnp.sin(u), jnp.sin(2 * u), jnp.cos(u), jnp.cos(2 * u)])
+    np.testing.assert_allclose(surrogate(u), surrogate.layers(features), rtol=1e-6)
+    assert surrogate.layers.layers[0].weight.shape == (5, 15)
+
+
+def test_only_a_smooth_activation_has_curvature():
+    u = jnp.array([0.3, -0.2])
+    curvature = lambda activation: jax.hessian(MLP(2, activation=activation, key=KEY))(u)
+    np.testing.assert_array_equal(curvature(jax.nn.leaky_relu), 0)
+    assert jnp.any(curvature(jax.nn.gelu) != 0)
+
+
+def test_the_quadratic_starts_as_the_identity_and_has_the_curvature_of_its_matrix():
+    quadratic = Quadratic(2, key=KEY)
+    assert quadratic(jnp.array([1.0, 2.0])) == 1 + 4 + 1
+    matrix = jnp.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0], [7.0, 8.0, 9.0]])
+    quadratic = eqx.tree_at(lambda q: q.matrix, quadratic, matrix)
+    u = jnp.array([0.5, -1.0])
+    assert quadratic(u) == jnp.append(u, 1) @ matrix @ jnp.append(u, 1)
+    np.testing.assert_allclose(jax.hessian(quadratic)(u), (matrix + matrix.T)[:2, :2])
+
+
+def test_keys_draw_the_weights():
+    same = [weights(MLP(4, key=jax.random.key(i))) for i in (0, 0, 1)]
+    np.testing.assert_array_equal(same[0][0], same[1][0])
+    assert not jnp.array_equal(same[0][0], same[2][0])
