@@ -1,12 +1,13 @@
 """Time of the filters on grids against the memory traffic that they cannot do without.
 
 The floor of a pass of `cross_bilateral` reads signal and guide and writes the signal; that of
-`laplacian` reads and writes the signal once. Both are divided by the bandwidth of a copy of the
-same array. Beside it stands the time of the exponentials of a pass, one for each tap, alone. All
-run in turn, and the ratio is taken turn by turn, so that what else the machine does falls on all.
+`laplacian` reads and writes the signal once. Both are divided by the highest bandwidth of a copy at
+any of the sizes: some copies wait for fresh pages of memory. Beside it stands the time of the
+exponentials of a pass, one for each tap, alone.
 """
 
 import json
+import math
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -54,19 +55,20 @@ def time_turns(space: tuple[int, ...], channels: int, turns: int) -> dict[str, n
     return {name: found[1:] for name, found in seconds.items()}  # the first turn compiles
 
 
-def measure(space: tuple[int, ...], channels: int, turns: int) -> dict[str, Any]:
-    """Bandwidth, floors, times and their ratios, for one size."""
-    seconds = time_turns(space, channels, turns)
-    traffic = 4 * np.prod(space).item() * channels  # bytes of one array
-    # the median of the copy, since turns in which it is disturbed would lift the floor
-    bandwidth = 2 * traffic / np.median(seconds["copy"]).item()
+def bandwidth(seconds: dict[str, np.ndarray], traffic: int) -> float:
+    """Bytes a second that a copy reads and writes."""
+    return 2 * traffic / np.median(seconds["copy"]).item()
+
+
+def compare(seconds: dict[str, np.ndarray], traffic: int, fastest: float) -> dict[str, Any]:
+    """Floors, times and their ratios, for arrays of `traffic` bytes."""
     needed = {"cross_bilateral": 3 * LEVELS * traffic, "laplacian": 2 * traffic}
     found: dict[str, Any] = {
-        "bandwidth": bandwidth,
+        "bandwidth": bandwidth(seconds, traffic),
         "milliseconds_of_exponentials": 1e3 * LEVELS * np.median(seconds["exponentials"]).item(),
     }
     for name in NAMES:
-        floor = needed[name] / bandwidth
+        floor = needed[name] / fastest
         found[name] = {
             "bytes": needed[name],
             "milliseconds": 1e3 * np.median(seconds[name]).item(),
@@ -78,11 +80,16 @@ def measure(space: tuple[int, ...], channels: int, turns: int) -> dict[str, Any]
 
 def main(folder: Path, turns: int = TURNS) -> None:
     """Measures, prints a table, and writes results.json and filters.png."""
-    results = {
-        f"{name}, {channels} channel{'s' if channels > 1 else ''}": measure(space, channels, turns)
+    measured = {
+        f"{name}, {channels} channel{'s' if channels > 1 else ''}": (
+            time_turns(space, channels, turns),
+            4 * math.prod(space) * channels,
+        )
         for name, space in SPACES.items()
         for channels in CHANNELS
     }
+    fastest = max(bandwidth(*each) for each in measured.values())
+    results = {size: compare(*each, fastest) for size, each in measured.items()}
     folder.mkdir(parents=True, exist_ok=True)
     content = {
         "command": "python -m benchmarks filters",
