@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks import methods, tasks
-from benchmarks._task import Task
+from benchmarks._task import NotAble, Task
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -75,7 +75,11 @@ def _run(name: str, options: argparse.Namespace, folder: Path, command: str) -> 
     from benchmarks import _family, _report, descents
 
     module = tasks.module(name)
-    built = module.build(options.full)
+    try:
+        built = module.build(options.full)
+    except NotAble as reason:
+        Console().print(f"{name} is not able here: {reason}.")
+        return
     first = built[0] if isinstance(built, list) else built
     if isinstance(first, descents.Descent):
         descents.run(built, options, folder, command)

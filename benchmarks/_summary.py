@@ -25,7 +25,7 @@ LEVELS = {"image_error": REDUCTIONS, "parameter_error": REDUCTIONS, "gap": GAPS}
 COSTS = ("evaluations", "seconds")
 PACKAGES = (
     *("smoothdiff", "jax", "jaxlib", "optax", "optimistix", "equinox", "lineax", "numpy", "scipy"),
-    *("mitsuba", "coco-experiment", "cma", "evosax", "jaxopt", "Py-BOBYQA"),
+    *("mitsuba", "coco-experiment", "cma", "evosax", "jaxopt", "Py-BOBYQA", "pygad"),
 )
 
 

@@ -28,6 +28,10 @@ EXPECTED = {
     "nelder_mead": (200, 1e-6, 1),
     "powell": (200, 1e-3, 1),
     "py_bobyqa": (200, 1e-6, 1),
+    "annealing": (600, 1e-2, 1),
+    "genetic_algorithm": (600, 1e-2, 99),
+    "spsa": (600, 1e-2, 5 * 2),
+    "zerograds": (600, 1e-2, 2),
     # the slope that sets the unit, then the value and the gradient of the first step
     "optimistix_bfgs": (200, 1e-6, 4 + 1 + 4),
     "jaxopt_lbfgs": (1600, 1e-2, None),
@@ -125,6 +129,7 @@ def test_double_precision(name):
     [
         ("cma_es", "cma"),
         ("evosax_snes", "evosax.algorithms"),
+        ("genetic_algorithm", "pygad"),
         ("py_bobyqa", "pybobyqa"),
         ("jaxopt_lbfgs", "jaxopt"),
     ],

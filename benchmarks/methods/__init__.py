@@ -21,6 +21,9 @@ METHODS = {
     "nelder_mead": "benchmarks.methods.scipy_local",
     "powell": "benchmarks.methods.scipy_local",
     "py_bobyqa": "benchmarks.methods.py_bobyqa",
+    "annealing": "benchmarks.methods.annealing",
+    "genetic_algorithm": "benchmarks.methods.genetic_algorithm",
+    "spsa": "benchmarks.methods.spsa",
     "optimistix_bfgs": "benchmarks.methods.optimistix_bfgs",
     "jaxopt_lbfgs": "benchmarks.methods.jaxopt_lbfgs",
     "our_gradient": "benchmarks.methods.our_gradient",
@@ -34,6 +37,7 @@ METHODS = {
     "bfgs_wolfe": "benchmarks.methods.quasi_newton",
     "bfgs_damped": "benchmarks.methods.quasi_newton",
     "bfgs_adaptive": "benchmarks.methods.adaptive_differences",
+    "zerograds": "benchmarks.methods.zerograds",
     "newton_cg": "benchmarks.methods.newton_cg",
     "gauss_newton": "benchmarks.methods.gauss_newton",
 }

@@ -21,6 +21,18 @@ BLACK_BOXES = {
     "ellipsoid": "benchmarks.tasks.ellipsoid",
     "bbob": "benchmarks.tasks.bbob",
 }
+# programs with switches, counts and rotations, and the weights of networks, as in ZeroGrads
+PROGRAMS = {
+    "led": "benchmarks.tasks.led",
+    "mosaic": "benchmarks.tasks.mosaic",
+    "rocket10": "benchmarks.tasks.rocket10",
+    "gravity": "benchmarks.tasks.gravity",
+    "wicker": "benchmarks.tasks.wicker",
+    "node-graph": "benchmarks.tasks.node_graph",
+    "texture256": "benchmarks.tasks.texture256",
+    "mlp": "benchmarks.tasks.mlp",
+    "spline-vae": "benchmarks.tasks.spline_vae",
+}
 DESCENTS = {
     "aniso": "benchmarks.tasks.aniso",
     "noisy": "benchmarks.tasks.noisy",
@@ -29,7 +41,7 @@ DESCENTS = {
     "mesh-cube": "benchmarks.tasks.mesh_cube",
     "mesh-horns": "benchmarks.tasks.mesh_horns",
 }
-TASKS = BLACK_BOXES | DESCENTS
+TASKS = BLACK_BOXES | PROGRAMS | DESCENTS
 
 
 def module(name: str) -> ModuleType:

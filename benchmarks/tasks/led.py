@@ -1,0 +1,85 @@
+"""LED: which of 336 segments of a display are lit? A segment is on where its parameter is over 1/2.
+
+Twelve panels of four digits with seven segments each. Each segment has three pixels, so the loss is
+in proportion to the wrong switches. Sigma is that of ZeroGrads (supplement, Table 1), in units of
+the domain.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from scipy import sparse
+
+import smoothdiff as sd
+from benchmarks._task import Budget, Task
+
+TITLE = "LED: 336 binary switches of a display"
+PANELS, DIGITS, SEGMENTS = (4, 3), 4, 7
+SIZE = PANELS[0] * PANELS[1] * DIGITS * SEGMENTS
+ON = 0.5
+SIGMA = 0.33
+# the segment of each pixel of a digit; the others are dark
+DIGIT = np.array(
+    [[int(c) if c.isdigit() else -1 for c in row] for row in (
+        ".000...", "1...2..", "1...2..", "1...2..", ".333...", "4...5..", "4...5..", "4...5..",
+        ".666...", ".......", ".......",
+    )]
+)  # fmt: skip
+
+
+def _segments() -> np.ndarray:
+    """The segment of each pixel of the display, -1 where there is none."""
+    digits = np.arange(SIZE // SEGMENTS).reshape(PANELS[0], PANELS[1] * DIGITS)
+    rows = [[np.where(DIGIT < 0, -1, DIGIT + SEGMENTS * k) for k in row] for row in digits]
+    return np.block(rows)
+
+
+SEGMENT = _segments()
+REFERENCE = np.where(np.random.default_rng(0).random(SIZE) < 0.5, 0.25, 0.75)
+
+
+def switches(y: Float[Array, "336"]) -> Bool[Array, "336"]:
+    """Which segments are on."""
+    return y > ON
+
+
+def draw(y: Float[Array, "336"]) -> Float[Array, "44 84"]:
+    """The display: a pixel is 1 where its segment is on."""
+    lit = switches(y).astype(y.dtype)
+    return jnp.where(SEGMENT < 0, jnp.zeros_like(y, shape=()), lit[np.maximum(SEGMENT, 0)])
+
+
+def support():
+    """Which pixels a parameter may change: those of its segment."""
+    pixels = np.flatnonzero(SEGMENT.ravel() >= 0)
+    entries = (np.ones(pixels.size), (pixels, SEGMENT.ravel()[pixels]))
+    return sd.matrix_support(sparse.coo_array(entries, (SEGMENT.size, SIZE)), SEGMENT.shape)
+
+
+def build(full: bool) -> Task:
+    """Starts are anywhere in the domain, so half of the switches are wrong."""
+    reference = jnp.asarray(REFERENCE, jnp.float32)
+    target = draw(reference)
+
+    def residuals(y: Float[Array, "336"]) -> Float[Array, "44 84"]:
+        return draw(y) - target
+
+    def loss(y: Float[Array, "336"]) -> Float[Array, ""]:
+        return jnp.mean(residuals(y) ** 2)
+
+    return Task(
+        name="led",
+        title=TITLE,
+        loss=loss,
+        exact_loss=loss,
+        start=lambda seed: jax.random.uniform(jax.random.key(seed), (SIZE,)),
+        reference=reference,
+        bounds=(jnp.zeros(SIZE), jnp.ones(SIZE)),
+        sigma=SIGMA,
+        budget=Budget(60_000, 120) if full else Budget(8000, 15),
+        seeds=10 if full else 3,
+        image=lambda y: jnp.stack([draw(y), 0.1 * draw(y), 0.1 * draw(y)], axis=-1),
+        residuals=residuals,
+        notes="The image error is the share of wrong switches, relative to that of the start.",
+    )

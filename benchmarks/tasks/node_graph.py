@@ -1,0 +1,100 @@
+"""Node graph: which of 24 edges does the graph of a procedural texture have?
+
+An edge is there where its entry rounds to 1. Three nodes make patterns, four change or join what
+they are given, and the last colours it. Of several edges to one input the first counts, so an edge
+may have no effect, and more than one graph has the sought texture. Sigma is that of ZeroGrads
+(supplement, Table 1).
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from benchmarks._task import Budget, Task
+
+TITLE = "Node graph: the edges of a procedural texture"
+PIXELS = 32
+# input -> the nodes from which an edge to it can come; the patterns are nodes 0 to 2
+INPUTS = {
+    "3a": (0, 1, 2),
+    "3b": (0, 1, 2),
+    "4a": (0, 1, 2),
+    "4b": (0, 1, 2),
+    "5a": (3, 4),
+    "5b": (3, 4),
+    "6": (2, 3, 4, 5),
+    "7": (3, 4, 5, 6),
+}
+SOUGHT = {"3a": 0, "3b": 1, "4a": 2, "4b": 1, "5a": 3, "5b": 4, "6": 5, "7": 6}
+EDGES = [(where, source) for where, sources in INPUTS.items() for source in sources]
+REFERENCE = np.array([0.75 if SOUGHT[where] == source else 0.25 for where, source in EDGES])
+NOTHING = 0.3  # what an input without an edge is given
+DARK, LIGHT = (0.1, 0.05, 0.2), (0.95, 0.8, 0.5)
+SIGMA = 0.2
+
+
+def _patterns() -> np.ndarray:
+    """Bricks, rings and stripes, (3, H, W)."""
+    y, x = np.mgrid[0:PIXELS, 0:PIXELS] / PIXELS
+    shifted = x + np.floor(4 * y) % 2 / 4
+    bricks = (4 * y % 1 > 0.25) & (2 * shifted % 1 > 0.125)
+    rings = 0.5 + 0.5 * np.cos(8 * np.pi * np.hypot(x - 0.5, y - 0.5))
+    return np.stack([bricks, rings, (x + y) * 3 % 1])
+
+
+PATTERNS = _patterns()
+
+
+def edges(y: Float[Array, "24"]) -> Bool[Array, "24"]:
+    """Which edges are there."""
+    return jnp.round(y) == 1
+
+
+def draw(y: Float[Array, "24"]) -> Float[Array, "32 32 3"]:
+    """The texture that the graph makes."""
+    there = dict(zip(EDGES, edges(y), strict=True))
+    nodes = dict(enumerate(jnp.asarray(PATTERNS, y.dtype)))
+
+    def given(where: str) -> Array:
+        picture = jnp.full_like(nodes[0], NOTHING)
+        for source in reversed(INPUTS[where]):
+            picture = jnp.where(there[where, source], nodes[source], picture)
+        return picture
+
+    nodes[3] = (given("3a") + given("3b")) / 2
+    nodes[4] = given("4a") * given("4b")
+    nodes[5] = jnp.maximum(given("5a"), given("5b"))
+    nodes[6] = 1 - given("6") ** 2
+    shade = given("7")[..., None]
+    dark, light = (jnp.asarray(colour, y.dtype)[None, None] for colour in (DARK, LIGHT))
+    return dark + (light - dark) * shade
+
+
+def build(full: bool) -> Task:
+    """Starts are anywhere in the domain, so each edge is there or not by chance."""
+    reference = jnp.asarray(REFERENCE, jnp.float32)
+    target = jax.jit(draw)(reference)
+
+    def residuals(y: Float[Array, "24"]) -> Float[Array, "32 32 3"]:
+        return draw(y) - target
+
+    def loss(y: Float[Array, "24"]) -> Float[Array, ""]:
+        return jnp.mean(residuals(y) ** 2)
+
+    size = len(EDGES)
+    return Task(
+        name="node-graph",
+        title=TITLE,
+        loss=loss,
+        exact_loss=loss,
+        start=lambda seed: jax.random.uniform(jax.random.key(seed), (size,)),
+        reference=reference,
+        bounds=(jnp.zeros(size), jnp.ones(size)),
+        sigma=SIGMA,
+        budget=Budget(10_000, 60) if full else Budget(2000, 10),
+        seeds=10 if full else 3,
+        image=draw,
+        residuals=residuals,
+        notes=f"{PIXELS} x {PIXELS} pixels; an edge may have no effect",
+    )
