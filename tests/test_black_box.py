@@ -420,6 +420,14 @@ def test_reraise_in_threads_gives_each_its_own():
         ]
 
 
+@pytest.fixture
+def listens_to_ctrl_c():
+    """A shell that starts the tests in the background tells them to ignore Ctrl-C."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def interrupted(x):
     signal.raise_signal(signal.SIGINT)
     return x
@@ -429,6 +437,7 @@ def raises_interrupt(x):
     raise KeyboardInterrupt
 
 
+@pytest.mark.usefixtures("listens_to_ctrl_c")
 @pytest.mark.parametrize("host", [interrupted, raises_interrupt])
 @pytest.mark.parametrize("on_error", ["raise", "nan"])
 def test_keyboard_interrupt_arrives_as_itself(host, on_error):
@@ -441,6 +450,7 @@ def test_keyboard_interrupt_arrives_as_itself(host, on_error):
             awaited(f, np.ones(3))
 
 
+@pytest.mark.usefixtures("listens_to_ctrl_c")
 def test_keyboard_interrupt_while_an_executor_works():
     """Ctrl-C goes to the main thread, which waits for the worker."""
     with concurrent.futures.ThreadPoolExecutor(1) as pool, pytest.raises(KeyboardInterrupt):
