@@ -35,18 +35,20 @@ def run_by(minimise: Callable, task: Task, fun: Callable[[Y], Any], solver: Any)
 
 
 class _Best:
-    """What is shown of a run with restarts, which begin at y0.
+    """What is shown of a run with restarts: back at y0, after it had moved away.
 
     A search that follows another one is hidden until it has seen something better.
     """
 
     def __init__(self, y0: Y):
         self._y0, self._shown, self._lowest = jax.device_get(y0), y0, np.inf
-        self._target = np.inf
+        self._moved, self._target = False, np.inf
 
     def after(self, step: Record) -> Y:
-        if jax.tree.all(jax.tree.map(np.array_equal, step.y, self._y0)):
+        moved = not jax.tree.all(jax.tree.map(np.array_equal, step.y, self._y0))
+        if self._moved and not moved:
             self._target = self._lowest
+        self._moved = moved
         self._lowest = min(self._lowest, step.fun)
         if step.fun < self._target:
             self._target, self._shown = np.inf, step.y
