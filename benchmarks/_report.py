@@ -1,6 +1,7 @@
 """Results as pictures and as a table on the terminal."""
 
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import jax.numpy as jnp
@@ -101,7 +102,7 @@ def _images(task: Task, results: dict[str, Any], path: Path) -> None:
                 axis.set(xticks=[], yticks=[], xlabel=f"error {note}")
                 axis.spines[:].set_visible(False)
                 if seed == 0:
-                    axis.set_title(name.replace(", ", ",\n"), fontsize=8, loc="center")
+                    axis.set_title(fill(name, 20), fontsize=8, loc="center")
             line[0].set_ylabel(f"start {seed}")
 
 

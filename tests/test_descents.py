@@ -17,8 +17,7 @@ from benchmarks import descents
 from benchmarks.descents import Configuration, Descent, _loop, _runs, keep_within, variants
 from benchmarks.descents._denoising import denoising
 from benchmarks.scenes import piecewise, plate, smoke
-from benchmarks.tasks import aniso, noisy, volume
-from benchmarks.tasks import plate as texture
+from benchmarks.tasks import aniso, noisy, texture, volume
 
 sgd: Any = optax.sgd
 OPTIONS = Namespace(full=False, seeds=None, fresh=False)

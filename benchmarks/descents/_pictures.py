@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -96,7 +97,7 @@ def panels(columns: Mapping[str, Pictures], path: Path) -> None:
                     _draw(axis, np.asarray(pictures[name]), sought.get(name), scale)
             line[0].set_ylabel(name)
         for axis, title in zip(axes[0], columns, strict=True):
-            axis.set_title(title.replace(", ", ",\n"), fontsize=8, loc="center")
+            axis.set_title(fill(title, 20), fontsize=8, loc="center")
 
 
 def _first(columns: Mapping[str, Pictures], name: str) -> Any:

@@ -36,7 +36,7 @@ PROGRAMS = {
 DESCENTS = {
     "aniso": "benchmarks.tasks.aniso",
     "noisy": "benchmarks.tasks.noisy",
-    "texture": "benchmarks.tasks.plate",
+    "texture": "benchmarks.tasks.texture",
     "volume": "benchmarks.tasks.volume",
     "mesh-cube": "benchmarks.tasks.mesh_cube",
     "mesh-horns": "benchmarks.tasks.mesh_horns",

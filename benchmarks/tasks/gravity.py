@@ -6,12 +6,15 @@ Where a cube tips over, the loss jumps. A stiff contact lasts no more than seven
 Sigma is that of ZeroGrads (supplement, Table 1), in units of the domain.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from benchmarks._task import Budget, Task
+from benchmarks.tasks._drawn import drawn
 
 TITLE = "Gravity: three cubes that are dropped"
 STEPS, SECONDS_PER_STEP, SEEN_EVERY = 900, 1 / 500, 225
@@ -112,30 +115,16 @@ def _cross(arm: Array, force: Array) -> Array:
 
 def build(full: bool) -> list[Task]:
     """Soft and stiff contacts."""
-    return [_task(f"{kind}-5d", kind, rate, full) for kind, rate in RATES.items()]
-
-
-def _task(name: str, kind: str, rate: float, full: bool) -> Task:
-    reference = jnp.asarray(REFERENCE)
-    seen = jax.jit(fall, static_argnums=1)(reference, rate)
-
-    def residuals(y: Float[Array, "5"]) -> Float[Array, "times 2 4 2"]:
-        return fall(y, rate) - seen
-
-    def loss(y: Float[Array, "5"]) -> Float[Array, ""]:
-        return jnp.mean(residuals(y) ** 2)
-
-    return Task(
-        name=name,
-        title=f"{TITLE}, {kind} contacts",
-        loss=loss,
-        exact_loss=loss,
-        start=lambda seed: jax.random.uniform(jax.random.key(seed), (5,)),
-        reference=reference,
-        bounds=(jnp.zeros(5), jnp.ones(5)),
-        sigma=SIGMA,
-        budget=Budget(3000, 120) if full else Budget(600, 20),
-        seeds=10 if full else 2,
-        residuals=residuals,
-        optimum=0.0,
-    )
+    return [
+        drawn(
+            f"{kind}-5d",
+            f"{TITLE}, {kind} contacts",
+            partial(fall, rate=rate),
+            np.asarray(REFERENCE),
+            sigma=SIGMA,
+            budget=Budget(3000, 120) if full else Budget(600, 20),
+            seeds=10 if full else 2,
+            optimum=0.0,
+        )
+        for kind, rate in RATES.items()
+    ]

@@ -5,7 +5,6 @@ in proportion to the wrong switches. Sigma is that of ZeroGrads (supplement, Tab
 the domain.
 """
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -13,6 +12,7 @@ from scipy import sparse
 
 import smoothdiff as sd
 from benchmarks._task import Budget, Task
+from benchmarks.tasks._drawn import drawn
 
 TITLE = "LED: 336 binary switches of a display"
 PANELS, DIGITS, SEGMENTS = (4, 3), 4, 7
@@ -59,27 +59,14 @@ def support():
 
 def build(full: bool) -> Task:
     """Starts are anywhere in the domain, so half of the switches are wrong."""
-    reference = jnp.asarray(REFERENCE, jnp.float32)
-    target = draw(reference)
-
-    def residuals(y: Float[Array, "336"]) -> Float[Array, "44 84"]:
-        return draw(y) - target
-
-    def loss(y: Float[Array, "336"]) -> Float[Array, ""]:
-        return jnp.mean(residuals(y) ** 2)
-
-    return Task(
-        name="led",
-        title=TITLE,
-        loss=loss,
-        exact_loss=loss,
-        start=lambda seed: jax.random.uniform(jax.random.key(seed), (SIZE,)),
-        reference=reference,
-        bounds=(jnp.zeros(SIZE), jnp.ones(SIZE)),
+    return drawn(
+        "led",
+        TITLE,
+        draw,
+        REFERENCE,
         sigma=SIGMA,
         budget=Budget(60_000, 120) if full else Budget(8000, 15),
         seeds=10 if full else 3,
         image=lambda y: jnp.stack([draw(y), 0.1 * draw(y), 0.1 * draw(y)], axis=-1),
-        residuals=residuals,
         notes="The image error is the share of wrong switches, relative to that of the start.",
     )

@@ -5,7 +5,6 @@ the picture is piecewise constant. A parameter of 1 is a quarter turn, from one 
 Sigma is that of ZeroGrads (supplement, Table 1), in units of the domain.
 """
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -13,6 +12,7 @@ from scipy import sparse
 
 import smoothdiff as sd
 from benchmarks._task import Budget, Task
+from benchmarks.tasks._drawn import drawn
 
 TITLE = "Mosaic: rotations of 320 cubes"
 ROWS, COLUMNS = 16, 20
@@ -81,28 +81,14 @@ def support():
 
 
 def build(full: bool) -> Task:
-    """Starts are anywhere in the domain."""
-    reference = jnp.asarray(REFERENCE, jnp.float32)
-    target = jax.jit(draw)(reference)
-
-    def residuals(y: Float[Array, "320"]) -> Float[Array, "48 100 3"]:
-        return draw(y) - target
-
-    def loss(y: Float[Array, "320"]) -> Float[Array, ""]:
-        return jnp.mean(residuals(y) ** 2)
-
-    return Task(
-        name="mosaic",
-        title=TITLE,
-        loss=loss,
-        exact_loss=loss,
-        start=lambda seed: jax.random.uniform(jax.random.key(seed), (SIZE,)),
-        reference=reference,
-        bounds=(jnp.zeros(SIZE), jnp.ones(SIZE)),
+    return drawn(
+        "mosaic",
+        TITLE,
+        draw,
+        REFERENCE,
         sigma=SIGMA,
         budget=Budget(60_000, 240) if full else Budget(8000, 30),
         seeds=10 if full else 2,
         image=draw,
-        residuals=residuals,
         notes=f"{BY_PIXEL[2]} x {BY_PIXEL[0]} pixels of {RAYS} x {RAYS} rays",
     )

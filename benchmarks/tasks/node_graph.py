@@ -6,12 +6,12 @@ may have no effect, and more than one graph has the sought texture. Sigma is tha
 (supplement, Table 1).
 """
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from benchmarks._task import Budget, Task
+from benchmarks.tasks._drawn import drawn
 
 TITLE = "Node graph: the edges of a procedural texture"
 PIXELS = 32
@@ -73,28 +73,14 @@ def draw(y: Float[Array, "24"]) -> Float[Array, "32 32 3"]:
 
 def build(full: bool) -> Task:
     """Starts are anywhere in the domain, so each edge is there or not by chance."""
-    reference = jnp.asarray(REFERENCE, jnp.float32)
-    target = jax.jit(draw)(reference)
-
-    def residuals(y: Float[Array, "24"]) -> Float[Array, "32 32 3"]:
-        return draw(y) - target
-
-    def loss(y: Float[Array, "24"]) -> Float[Array, ""]:
-        return jnp.mean(residuals(y) ** 2)
-
-    size = len(EDGES)
-    return Task(
-        name="node-graph",
-        title=TITLE,
-        loss=loss,
-        exact_loss=loss,
-        start=lambda seed: jax.random.uniform(jax.random.key(seed), (size,)),
-        reference=reference,
-        bounds=(jnp.zeros(size), jnp.ones(size)),
+    return drawn(
+        "node-graph",
+        TITLE,
+        draw,
+        REFERENCE,
         sigma=SIGMA,
         budget=Budget(10_000, 60) if full else Budget(2000, 10),
         seeds=10 if full else 3,
         image=draw,
-        residuals=residuals,
         notes=f"{PIXELS} x {PIXELS} pixels; an edge may have no effect",
     )

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from benchmarks._task import Budget, Task
+from benchmarks.tasks._drawn import drawn
 from benchmarks.tasks.rocket import DRAG, GRAVITY, SECONDS_PER_STEP
 
 TITLE = "Rocket10: when ten engines are switched off"
@@ -42,26 +43,12 @@ def fly(y: Float[Array, "10"]) -> Float[Array, "10 2"]:
 
 
 def build(full: bool) -> Task:
-    """Starts are anywhere in the domain."""
-    reference = jnp.asarray(REFERENCE, jnp.float32)
-    target = jax.jit(fly)(reference)
-
-    def residuals(y: Float[Array, "10"]) -> Float[Array, "10 2"]:
-        return fly(y) - target
-
-    def loss(y: Float[Array, "10"]) -> Float[Array, ""]:
-        return jnp.mean(residuals(y) ** 2)
-
-    return Task(
-        name="rocket10",
-        title=TITLE,
-        loss=loss,
-        exact_loss=loss,
-        start=lambda seed: jax.random.uniform(jax.random.key(seed), (SIZE,)),
-        reference=reference,
-        bounds=(jnp.zeros(SIZE), jnp.ones(SIZE)),
+    return drawn(
+        "rocket10",
+        TITLE,
+        fly,
+        REFERENCE,
         sigma=SIGMA,
         budget=Budget(10_000, 60) if full else Budget(2000, 10),
         seeds=10 if full else 3,
-        residuals=residuals,
     )

@@ -4,12 +4,12 @@ Each parameter is a share of its range of integers, so the loss is constant on e
 Sigma is that of ZeroGrads (supplement, Table 1), in units of the domain.
 """
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from benchmarks._task import Budget, Task
+from benchmarks.tasks._drawn import drawn
 
 TITLE = "Wicker: integer counts of a woven texture"
 PIXELS = 64
@@ -47,28 +47,14 @@ def draw(y: Float[Array, "3"]) -> Float[Array, "64 64 3"]:
 
 
 def build(full: bool) -> Task:
-    """Starts are anywhere in the domain."""
-    reference = jnp.asarray(REFERENCE, jnp.float32)
-    target = jax.jit(draw)(reference)
-
-    def residuals(y: Float[Array, "3"]) -> Float[Array, "64 64 3"]:
-        return draw(y) - target
-
-    def loss(y: Float[Array, "3"]) -> Float[Array, ""]:
-        return jnp.mean(residuals(y) ** 2)
-
-    return Task(
-        name="wicker",
-        title=TITLE,
-        loss=loss,
-        exact_loss=loss,
-        start=lambda seed: jax.random.uniform(jax.random.key(seed), (3,)),
-        reference=reference,
-        bounds=(jnp.zeros(3), jnp.ones(3)),
+    return drawn(
+        "wicker",
+        TITLE,
+        draw,
+        REFERENCE,
         sigma=SIGMA,
         budget=Budget(3000, 60) if full else Budget(600, 10),
         seeds=10 if full else 3,
         image=draw,
-        residuals=residuals,
         notes=f"{PIXELS} x {PIXELS} pixels",
     )

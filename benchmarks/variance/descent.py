@@ -15,7 +15,7 @@ import optax
 from jaxtyping import Array, Float
 
 import smoothdiff as sd
-from benchmarks.tasks import texture
+from benchmarks.scenes import blurred_texture as texture
 
 SIGMA = 0.1
 LEVELS = {"90": 0.1, "99": 0.01}

@@ -15,7 +15,8 @@ from jax.scipy.special import ndtr
 from jaxtyping import Array, Float
 
 import smoothdiff as sd
-from benchmarks.tasks import boxes, texture
+from benchmarks.scenes import blurred_texture as texture
+from benchmarks.tasks import boxes
 
 PIXELS = 32
 
@@ -127,7 +128,7 @@ def _normal_points(n: int) -> Float[np.ndarray, "16384 n"]:
 
 
 def texels() -> Problem:
-    """The texture of `tasks/texture.py`, half-way between noise and the reference."""
+    """The texture of `scenes/blurred_texture.py`, half-way between noise and the reference."""
     n = texture.PIXELS**2
     grid = lambda y: y.reshape(texture.PIXELS, texture.PIXELS)
     local = sd.local_support(texture.RADIUS)

@@ -8,6 +8,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from smoothdiff._params import as_key
@@ -69,6 +70,17 @@ class Progress(eqx.Module):
             best_fun=best_fun,
             best_stderr=best_stderr,
         )
+
+
+def stopped(progress: Progress, enough: Bool[Array, ""]) -> tuple[Bool[Array, ""], optx.RESULTS]:
+    """What `terminate` returns: the run is over after a failed step, or when it is `enough`."""
+    result = optx.RESULTS.where(progress.finite, optx.RESULTS.successful, optx.RESULTS.nonfinite)
+    return enough | ~progress.finite, result
+
+
+def unless_failed(finite: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
+    """`new`; after a failed step `old`, so that the iterate can still be used."""
+    return jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, old)
 
 
 class AbstractSmoothSolver(eqx.Module):

@@ -24,6 +24,8 @@ from smoothdiff._solvers._base import (
     promotion,
     read_options,
     sigma_at,
+    stopped,
+    unless_failed,
 )
 
 # so many small updates in a row count as convergence: under noise a single one is luck
@@ -183,11 +185,8 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
             moved, size = self.norm(jax.tree.map(jnp.subtract, new_y, y)), self.norm(y)
             quiet = jnp.where(moved < self.atol + self.rtol * size, state.quiet + 1, 0)
         finite = all_finite((fun, grad, new_y))
-        # a failed step leaves everything as it was, so that the iterate can still be used
-        new_y, opt_state, average = jax.tree.map(
-            lambda new, old: jnp.where(finite, new, old),
-            (new_y, opt_state, average),
-            (y, state.opt_state, state.average),
+        new_y, opt_state, average = unless_failed(
+            finite, (new_y, opt_state, average), (y, state.opt_state, state.average)
         )
         sigma = sigma_at(self.sigma, progress.step)
         progress = progress.after(y, fun, stderr, sigma, self.num_samples, finite)
@@ -197,9 +196,7 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """After small updates in a row, or a failed step."""
-        finite = state.progress.finite
-        result = optx.RESULTS.where(finite, optx.RESULTS.successful, optx.RESULTS.nonfinite)
-        return (state.quiet >= _PATIENCE) | ~finite, result
+        return stopped(state.progress, state.quiet >= _PATIENCE)
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         """Judges the last iterate, the average and the best recorded on the next step's samples."""

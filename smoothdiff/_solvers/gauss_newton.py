@@ -21,6 +21,8 @@ from smoothdiff._solvers._base import (
     promotion,
     read_options,
     sigma_at,
+    stopped,
+    unless_failed,
 )
 from smoothdiff._solvers._parameter_regression import gauss_newton_step
 
@@ -244,20 +246,15 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             small = moved < self.atol + self.rtol * self.norm(y)
         quiet = jnp.where(small, state.quiet + 1, 0)
         finite = enough & all_finite((fun, theta, scale))
-        # a failed step leaves everything as it was, so that the iterate can still be used
         progress = progress.after(y, fun, stderr, sigma, count, finite)
         after = GaussNewtonState(progress, scale, points, residuals, valid, quiet)
         before = eqx.tree_at(lambda s: s.progress, state, progress)
-        new_y, state = jax.tree.map(
-            lambda a, b: jnp.where(finite, a, b), (new_y, after), (y, before)
-        )
+        new_y, state = unless_failed(finite, (new_y, after), (y, before))
         return new_y, state, jax.tree.map(lambda a: a[0], aux)
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """After small steps in a row, or a failed one."""
-        finite = state.progress.finite
-        result = optx.RESULTS.where(finite, optx.RESULTS.successful, optx.RESULTS.nonfinite)
-        return (state.quiet >= _PATIENCE) | ~finite, result
+        return stopped(state.progress, state.quiet >= _PATIENCE)
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         """Judges the last iterate and the best recorded on the next step's samples."""

@@ -23,6 +23,8 @@ from smoothdiff._solvers._base import (
     promotion,
     read_options,
     sigma_at,
+    stopped,
+    unless_failed,
 )
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._noisy_step import outcome, propose, revise
@@ -87,6 +89,10 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         restarts: how many searches may follow, each from the first point and with the first sigma,
             but with other random numbers: for functions with several minima. The best point of all
             is returned.
+
+    Raises:
+        ValueError: fewer than two samples or kept ones, negative restarts, another `nonfinite`;
+            and, when it runs, a leaf without a sigma, or a sampler with weights.
 
     Example:
         >>> import jax, jax.numpy as jnp, optimistix as optx, smoothdiff as sd
@@ -252,11 +258,8 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         value = model.value(here)
         new_trust = revise(trust, step, good, ratio, value, small, self._adaptive)
         finite = all_finite((batch.values if batch.valid is None else batch.scale, x))
-        # a failed step leaves everything as it was
-        new_y, new_search = jax.tree.map(
-            lambda a, b: jnp.where(finite, a, b),
-            (new_y, kept.moved(base, new_metric, new_trust)),
-            (y, search),
+        new_y, new_search = unless_failed(
+            finite, (new_y, kept.moved(base, new_metric, new_trust)), (y, search)
         )
         progress = progress.after(
             y,
@@ -281,9 +284,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """After `patience` steps in a row that led nowhere, or a failed step."""
-        finite = state.progress.finite
-        result = optx.RESULTS.where(finite, optx.RESULTS.successful, optx.RESULTS.nonfinite)
-        return state.search.done(self.patience) | ~finite, result
+        return stopped(state.progress, state.search.done(self.patience))
 
     def reason(self, state: NewtonCGState) -> str:
         """Small steps, or a gradient that is all noise however many samples there are."""

@@ -25,6 +25,8 @@ from smoothdiff._solvers._base import (
     promotion,
     read_options,
     sigma_at,
+    stopped,
+    unless_failed,
 )
 from smoothdiff._solvers._surrogate_fit import Fit
 from smoothdiff._stderr import value_stderr
@@ -97,6 +99,12 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
             `atol + rtol * norm(y)`.
         atol: absolute tolerance. By default both are zero, and the run uses up its budget.
         norm: the norm of updates and iterates.
+
+    Raises:
+        TypeError: a surrogate that cannot be called, an optimizer that is no optax transformation.
+        ValueError: no steps, or one sample where differences are fitted; and, when it runs, a leaf
+            without a sigma, an inner sigma that is negative or of another structure, a sampler with
+            weights, `local=False` without bounds.
 
     Example:
         >>> import jax, jax.numpy as jnp, smoothdiff as sd
@@ -293,11 +301,8 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
             moved, length = self.norm(jax.tree.map(jnp.subtract, new_y, y)), self.norm(y)
             quiet = jnp.where(moved < self.atol + self.rtol * length, state.quiet + 1, 0)
         finite = all_finite((fit.weights, fit.spread, new_y))
-        # a failed step leaves everything as it was, so that the iterate can still be used
-        new_y, fit, opt_state = jax.tree.map(
-            lambda new, old: jnp.where(finite, new, old),
-            (new_y, fit, opt_state),
-            (y, state.fit, state.opt_state),
+        new_y, fit, opt_state = unless_failed(
+            finite, (new_y, fit, opt_state), (y, state.fit, state.opt_state)
         )
         fun, stderr = self._mean(batch)
         sigma = sigma_at(self.sigma, progress.step)
@@ -328,9 +333,7 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """After small updates in a row, or a failed step."""
-        finite = state.progress.finite
-        result = optx.RESULTS.where(finite, optx.RESULTS.successful, optx.RESULTS.nonfinite)
-        return (state.quiet >= _PATIENCE) | ~finite, result
+        return stopped(state.progress, state.quiet >= _PATIENCE)
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         """Judges the last iterate and the best recorded, smoothed by the inner kernel alone."""
