@@ -183,8 +183,9 @@ def run(
 def _watched(task: Task, counter: Counter) -> Task:
     """The task as the methods see it: whatever evaluates it is counted."""
     watched: dict[str, Any] = {"loss": counter.watch(task.loss)}
-    if task.residuals is not None:
-        watched["residuals"] = counter.watch(task.residuals)
+    for name in ("residuals", "terms"):
+        if (fun := getattr(task, name)) is not None:
+            watched[name] = counter.watch(fun)
     if (native_ad := task.native_ad) is not None:
         watched["native_ad"] = lambda: counter.watch_native_ad(native_ad())
     return dataclasses.replace(task, **watched)
@@ -228,7 +229,7 @@ def _solve(task: Task, solve: Solve, seed: int, counter: Counter, exact_loss: Lo
     evaluations, seconds, ys = zip(*trace, strict=True)
     gap = np.array([float(exact_loss(unravel(y))) for y in ys]) - (task.optimum or 0.0)
     sought = _flat(task.reference if task.choose is None else task.choose(seed))
-    distance = np.linalg.norm(np.asarray(ys, float) - sought.astype(float), axis=1)
+    distance = _distances(task, unravel, ys, sought)
     return {
         "seed": seed,
         "ended": ended,
@@ -242,6 +243,16 @@ def _solve(task: Task, solve: Solve, seed: int, counter: Counter, exact_loss: Lo
     }
 
 
+def _distances(task: Task, unravel: Callable, ys: Sequence[np.ndarray], sought) -> np.ndarray:
+    """How far each point is from the y that is sought, or how many entries are wrong."""
+    if task.discrete is None:
+        return np.linalg.norm(np.asarray(ys, float) - sought.astype(float), axis=1)
+    read = jax.jit(task.discrete)
+    meaning = lambda y: np.asarray(read(unravel(y)))
+    wrong = [np.sum(meaning(y) != meaning(sought)) for y in ys]
+    return np.asarray(wrong, float)
+
+
 def _flat(y: Y) -> np.ndarray:
     return np.concatenate([np.ravel(np.asarray(leaf)) for leaf in jax.tree.leaves(y)])
 
@@ -253,7 +264,10 @@ def _behaviour(task: Task) -> str:
     points = task.start(0), task.reference
     losses = [float(task.loss(y)) for y in points]
     bounds = [_flat(y).tolist() for y in (*points, *task.bounds)]
-    return repr((task.name, task.budget, task.sigma, task.notes, losses, bounds))
+    said = (task.name, task.budget, task.sigma, task.notes, losses, bounds)
+    if task.discrete is not None:
+        said += ([np.asarray(task.discrete(y)).tolist() for y in points],)
+    return repr(said)
 
 
 def _hash(*texts: str) -> str:

@@ -53,6 +53,11 @@ class Task:
             where that cannot run.
         residuals: y -> array, such that the loss is the sum or the mean of its squares, or None: a
             picture minus its reference, say. A call is counted like a call of the loss.
+        terms: y -> array, such that the loss is the sum of its entries, with `support`; or None. A
+            call is counted likewise.
+        support: Which of the terms a parameter may influence, as for `smoothdiff.smooth`.
+        discrete: What y means to a program of switches and counts, y -> array, or None. The
+            parameter error is then the number of its entries that differ from the reference's.
         precision: What the task is run in; all of its functions are called in it.
         optimum: The lowest value of the loss, or None. With it, runs are also scored by how far
             above it they are.
@@ -74,6 +79,9 @@ class Task:
     image: Callable[[Y], jax.Array] | None = None
     native_ad: Callable[[], NativeAD] | None = None
     residuals: Callable[[Y], jax.Array] | None = None
+    terms: Callable[[Y], jax.Array] | None = None
+    support: Callable[[Y], Any] | None = None
+    discrete: Callable[[Y], jax.Array] | None = None
     precision: Literal["float32", "float64"] = "float32"
     optimum: float | None = None
     choose: Callable[[int], Y] | None = None
