@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import jax
+import jax.numpy as jnp
 
 Y: TypeAlias = Any  # the parameters: an array or a pytree of arrays
 Key: TypeAlias = jax.Array
@@ -28,6 +29,28 @@ class Budget(NamedTuple):
 
     evaluations: int
     seconds: float
+
+
+class Grey(NamedTuple):
+    """A loss in two parts, the mean over cases: what AD knows, and a black box behind it.
+
+    Args:
+        white: What the black box is given in a case, (y, case) -> array; say, a network's answer to
+            a picture. JAX differentiates it.
+        black: The loss of a case, (array, case) -> number. Each call is counted.
+        cases: Their numbers.
+        sigma: The scale of what is between the two.
+    """
+
+    white: Callable[[Y, jax.Array], jax.Array]
+    black: Callable[[jax.Array, jax.Array], jax.Array]
+    cases: jax.Array
+    sigma: float
+
+    def loss(self, y: Y) -> jax.Array:
+        """The mean over all cases."""
+        each = jax.vmap(lambda case: self.black(self.white(y, case), case))
+        return jnp.mean(each(self.cases))
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +79,10 @@ class Task:
         terms: y -> array, such that the loss is the sum of its entries, with `support`; or None. A
             call is counted likewise.
         support: Which of the terms a parameter may influence, as for `smoothdiff.smooth`.
+        grey: The loss in two parts, for methods that use AD where they can; or None. With it, the
+            loss is that of these parts, and costs an evaluation for each case.
+        distance: How far y is from what is sought, y -> number, for a y that is one of many, such
+            as the weights of a network; or None. It is the parameter error then.
         discrete: What y means to a program of switches and counts, y -> array, or None. The
             parameter error is then the number of its entries that differ from the reference's.
         precision: What the task is run in; all of its functions are called in it.
@@ -81,6 +108,8 @@ class Task:
     residuals: Callable[[Y], jax.Array] | None = None
     terms: Callable[[Y], jax.Array] | None = None
     support: Callable[[Y], Any] | None = None
+    grey: Grey | None = None
+    distance: Callable[[Y], jax.Array] | None = None
     discrete: Callable[[Y], jax.Array] | None = None
     precision: Literal["float32", "float64"] = "float32"
     optimum: float | None = None

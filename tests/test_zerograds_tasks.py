@@ -116,13 +116,13 @@ def test_mosaic_is_what_rays_see():
         cube = int(np.argmin(first))
         if np.isinf(first[cube]):
             return np.full(3, mosaic.FLOOR)
-        return mosaic.COLOURS[cube] * mosaic.SHADES[int(np.argmax(enter[:, cube]))]
+        return mosaic.COLOURS.reshape(-1, 3)[cube] * mosaic.SHADES[int(np.argmax(enter[:, cube]))]
 
     pixels = np.random.default_rng(6).integers(0, picture.shape[:2], (100, 2))
     different = 0
     for pixel in pixels:
         rays = itertools.product(*(mosaic.RAYS * at + np.arange(mosaic.RAYS) for at in pixel))
-        seen = np.mean([ray_sees(mosaic.X[ray], mosaic.V[ray]) for ray in rays], axis=0)
+        seen = np.mean([ray_sees(mosaic.X[ray], mosaic.V[ray[0]]) for ray in rays], axis=0)
         different += not np.allclose(picture[tuple(pixel)], seen, atol=1e-5)
     assert different <= 1  # a ray along an edge
 
@@ -142,12 +142,33 @@ def test_a_parameter_changes_only_its_support(module, key):
         assert may.mean() < 0.02
 
 
+@pytest.mark.parametrize("module", [led, mosaic, texture256], ids=name)
+def test_the_loss_is_the_sum_of_the_terms(module):
+    (task,) = built(module)
+    assert task.terms is not None
+    assert task.support is not None
+    y = task.start(0)
+    terms = jax.jit(task.terms)(y)
+    assert terms.shape == task.support(y).shape
+    assert float(terms.sum()) == pytest.approx(float(jax.jit(task.loss)(y)), rel=1e-5)
+
+
+@pytest.mark.parametrize("module", [led, wicker, node_graph], ids=name)
+def test_what_is_not_wrong_is_drawn_right(module):
+    (task,) = built(module)
+    assert task.discrete is not None
+    assert task.optimum == 0
+    sought, found = task.discrete(task.reference), task.discrete(task.start(0))
+    assert 0 < jnp.sum(found != sought) <= SIZES[module]
+    nudged = task.reference + jnp.where(task.reference > 0.5, 1e-3, -1e-3)
+    assert np.array_equal(task.discrete(nudged), sought)
+    assert jax.jit(task.loss)(nudged) == 0
+
+
 def test_the_support_of_led_serves_the_gradient(key):
     (task,) = built(led)
-    residuals = task.residuals
-    assert residuals is not None
-    terms = lambda y: residuals(y) ** 2
-    grad = sd.smooth_grad(terms, task.sigma, num_samples=64, support=led.support())
+    assert task.terms is not None
+    grad = sd.smooth_grad(task.terms, task.sigma, num_samples=64, support=task.support)
     y = task.start(0)
     slope = np.asarray(jax.jit(grad)(key, y))
     wrong = np.asarray(led.switches(y) != led.switches(task.reference))

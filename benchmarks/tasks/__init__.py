@@ -33,6 +33,28 @@ PROGRAMS = {
     "mlp": "benchmarks.tasks.mlp",
     "spline-vae": "benchmarks.tasks.spline_vae",
 }
+# scenes of Mitsuba with few parameters
+SCENES = {
+    "shadow": BLACK_BOXES["shadow"],
+    "brdf": BLACK_BOXES["brdf"],
+    "mug": "benchmarks.scenes.mug",
+    "bunny": "benchmarks.scenes.bunny",
+    "cornell-box": "benchmarks.scenes.cornell_box",
+    "glass-ball": "benchmarks.scenes.glass_ball",
+    "mirror": "benchmarks.scenes.mirror",
+    "occlusion": "benchmarks.scenes.occlusion",
+    "global-illumination": "benchmarks.scenes.global_illumination",
+    "sort": "benchmarks.scenes.sort",
+}
+# scenes with many parameters, and networks in front of a renderer
+LARGE = {
+    "texture32": "benchmarks.tasks.texture32",
+    "caustic": "benchmarks.tasks.caustic",
+    "suzanne": "benchmarks.tasks.suzanne",
+    "banana": "benchmarks.tasks.banana",
+    "cnn": "benchmarks.tasks.cnn",
+    "cnn5": "benchmarks.tasks.cnn5",
+}
 DESCENTS = {
     "aniso": "benchmarks.tasks.aniso",
     "noisy": "benchmarks.tasks.noisy",
@@ -41,7 +63,8 @@ DESCENTS = {
     "mesh-cube": "benchmarks.tasks.mesh_cube",
     "mesh-horns": "benchmarks.tasks.mesh_horns",
 }
-TASKS = BLACK_BOXES | PROGRAMS | DESCENTS
+ALL_SCENES = SCENES | LARGE  # what `run all` runs and `report` shows
+TASKS = BLACK_BOXES | PROGRAMS | SCENES | LARGE | DESCENTS
 
 
 def module(name: str) -> ModuleType:

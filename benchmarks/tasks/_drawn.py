@@ -16,6 +16,7 @@ def drawn(
     title: str,
     draw: Callable[[Float[Array, " n"]], Float[Array, "..."]],
     reference: np.ndarray,
+    support: Any = None,
     **others: Any,
 ) -> Task:
     """The task of finding what draws the same as the reference does.
@@ -28,6 +29,7 @@ def drawn(
         title: As in `Task`.
         draw: From parameters to an array: a picture, or places at some times.
         reference: The parameters that are sought, each in [0, 1].
+        support: Which parts of what is drawn a parameter may influence, or None.
         others: Further fields of the task.
     """
     sought = jnp.asarray(reference, jnp.float32)
@@ -39,6 +41,9 @@ def drawn(
     def loss(y: Float[Array, " n"]) -> Float[Array, ""]:
         return jnp.mean(residuals(y) ** 2)
 
+    def terms(y: Float[Array, " n"]) -> Float[Array, "..."]:
+        return residuals(y) ** 2 / target.size
+
     return Task(
         name=name,
         title=title,
@@ -48,5 +53,7 @@ def drawn(
         reference=sought,
         bounds=(jnp.zeros_like(sought), jnp.ones_like(sought)),
         residuals=residuals,
+        terms=None if support is None else terms,
+        support=support,
         **others,
     )

@@ -13,10 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from benchmarks import methods
 from benchmarks._task import Budget, Task
 from benchmarks.tasks._drawn import drawn
 
 TITLE = "Gravity: three cubes that are dropped"
+METHODS = methods.PROGRAMS
 STEPS, SECONDS_PER_STEP, SEEN_EVERY = 900, 1 / 500, 225
 GRAVITY, FRICTION, SLIP = 9.81, 0.6, 0.05
 HALF, INERTIA = 0.5, 1 / 6  # of cubes of mass 1
@@ -122,7 +124,7 @@ def build(full: bool) -> list[Task]:
             partial(fall, rate=rate),
             np.asarray(REFERENCE),
             sigma=SIGMA,
-            budget=Budget(3000, 120) if full else Budget(600, 20),
+            budget=Budget(3000, 600) if full else Budget(600, 120),
             seeds=10 if full else 2,
             optimum=0.0,
         )

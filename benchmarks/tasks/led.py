@@ -11,10 +11,12 @@ from jaxtyping import Array, Bool, Float
 from scipy import sparse
 
 import smoothdiff as sd
+from benchmarks import methods
 from benchmarks._task import Budget, Task
 from benchmarks.tasks._drawn import drawn
 
 TITLE = "LED: 336 binary switches of a display"
+METHODS = methods.PROGRAMS
 PANELS, DIGITS, SEGMENTS = (4, 3), 4, 7
 SIZE = PANELS[0] * PANELS[1] * DIGITS * SEGMENTS
 ON = 0.5
@@ -64,9 +66,12 @@ def build(full: bool) -> Task:
         TITLE,
         draw,
         REFERENCE,
+        support(),
         sigma=SIGMA,
-        budget=Budget(60_000, 120) if full else Budget(8000, 15),
+        budget=Budget(60_000, 600) if full else Budget(8000, 120),
         seeds=10 if full else 3,
         image=lambda y: jnp.stack([draw(y), 0.1 * draw(y), 0.1 * draw(y)], axis=-1),
-        notes="The image error is the share of wrong switches, relative to that of the start.",
+        discrete=switches,
+        optimum=0.0,
+        notes="Both errors are the wrong switches, relative to those of the start.",
     )

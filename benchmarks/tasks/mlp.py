@@ -10,10 +10,12 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from benchmarks import methods
 from benchmarks._task import Budget, Task
 from benchmarks.scenes import digits, networks
 
 TITLE = "MLP: 35,152 weights of a network that draws a digit"
+METHODS = methods.MANY_PARAMETERS
 LAYERS = (256, 32, 32, 784)
 DIGIT = 3
 CONTRAST = 0.96  # of the digit: a sigmoid reaches neither 0 nor 1
@@ -54,7 +56,7 @@ def build(full: bool) -> Task:
         reference=reference,
         bounds=(jnp.full_like(reference, -BOUND), jnp.full_like(reference, BOUND)),
         sigma=SIGMA,
-        budget=Budget(100_000, 240) if full else Budget(4000, 20),
+        budget=Budget(100_000, 1200) if full else Budget(4000, 120),
         seeds=10 if full else 1,
         image=image,
         notes="Many networks draw the digit: the parameter error says nothing.",

@@ -10,10 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from benchmarks import methods
 from benchmarks._task import Budget, Task
 from benchmarks.tasks._drawn import drawn
 
 TITLE = "Node graph: the edges of a procedural texture"
+METHODS = methods.PROGRAMS
 PIXELS = 32
 # input -> the nodes from which an edge to it can come; the patterns are nodes 0 to 2
 INPUTS = {
@@ -79,8 +81,10 @@ def build(full: bool) -> Task:
         draw,
         REFERENCE,
         sigma=SIGMA,
-        budget=Budget(10_000, 60) if full else Budget(2000, 10),
+        budget=Budget(10_000, 240) if full else Budget(2000, 60),
         seeds=10 if full else 3,
         image=draw,
+        discrete=edges,
+        optimum=0.0,
         notes=f"{PIXELS} x {PIXELS} pixels; an edge may have no effect",
     )

@@ -9,11 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from benchmarks import methods
 from benchmarks._task import Budget, Task
 from benchmarks.tasks._drawn import drawn
 from benchmarks.tasks.rocket import DRAG, GRAVITY, SECONDS_PER_STEP
 
 TITLE = "Rocket10: when ten engines are switched off"
+METHODS = methods.PROGRAMS
 SIZE, STEPS = 10, 150
 TILT = np.linspace(-0.5, 0.5, SIZE)  # of an engine, in radians from upright
 THRUST = 18.0 + 4.0 * np.cos(3.0 * np.arange(SIZE))
@@ -49,6 +51,7 @@ def build(full: bool) -> Task:
         fly,
         REFERENCE,
         sigma=SIGMA,
-        budget=Budget(10_000, 60) if full else Budget(2000, 10),
+        budget=Budget(10_000, 240) if full else Budget(2000, 60),
         seeds=10 if full else 3,
+        optimum=0.0,
     )

@@ -17,10 +17,12 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 from scipy import interpolate
 
+from benchmarks import methods
 from benchmarks._task import Budget, Task
 from benchmarks.scenes import digits, networks
 
 TITLE = "Spline VAE: 8,764 weights of a decoder that draws digits"
+METHODS = methods.MANY_PARAMETERS
 LAYERS = (20, 34, 146, 20)
 POINTS, SAMPLES = 10, 120  # of a spline: what it goes through, and what is drawn
 PEN = 2  # its width, in pixels
@@ -109,7 +111,7 @@ def build(full: bool) -> Task:
         reference=reference,
         bounds=(jnp.full_like(reference, -BOUND), jnp.full_like(reference, BOUND)),
         sigma=SIGMA,
-        budget=Budget(100_000, 240) if full else Budget(4000, 20),
+        budget=Budget(100_000, 1200) if full else Budget(4000, 120),
         seeds=10 if full else 1,
         image=image,
         notes="Many decoders draw the digits: the parameter error says nothing.",

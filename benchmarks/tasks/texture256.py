@@ -8,9 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from benchmarks import methods
 from benchmarks._task import Budget, Task
 
 TITLE = "Texture256: 196,608 values of a texture"
+METHODS = methods.MANY_PARAMETERS
 PIXELS = 256
 SHAPE = (PIXELS, PIXELS, 3)
 SIGMA = 0.025
@@ -33,6 +35,9 @@ def build(full: bool) -> Task:
     def loss(y: Float[Array, "256 256 3"]) -> Float[Array, ""]:
         return jnp.mean((y - reference) ** 2)
 
+    def terms(y: Float[Array, "256 256 3"]) -> Float[Array, "256 256 3"]:
+        return (y - reference) ** 2 / reference.size
+
     return Task(
         name="texture256",
         title=TITLE,
@@ -42,7 +47,9 @@ def build(full: bool) -> Task:
         reference=reference,
         bounds=(jnp.zeros(SHAPE), jnp.ones(SHAPE)),
         sigma=SIGMA,
-        budget=Budget(100_000, 240) if full else Budget(2000, 20),
+        budget=Budget(100_000, 1200) if full else Budget(2000, 120),
         seeds=10 if full else 1,
         image=lambda y: y,
+        terms=terms,
+        support=lambda y: y,
     )

@@ -8,10 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from benchmarks import methods
 from benchmarks._task import Budget, Task
 from benchmarks.tasks._drawn import drawn
 
 TITLE = "Wicker: integer counts of a woven texture"
+METHODS = methods.PROGRAMS
 PIXELS = 64
 FEWEST, CHOICES = np.array([2, 2, 1]), np.array([8, 8, 4])  # upright stakes, others, repetitions
 COUNTS = np.array([4, 6, 2])  # those that are sought
@@ -53,8 +55,10 @@ def build(full: bool) -> Task:
         draw,
         REFERENCE,
         sigma=SIGMA,
-        budget=Budget(3000, 60) if full else Budget(600, 10),
+        budget=Budget(3000, 240) if full else Budget(600, 60),
         seeds=10 if full else 3,
         image=draw,
+        discrete=counts,
+        optimum=0.0,
         notes=f"{PIXELS} x {PIXELS} pixels",
     )
