@@ -12,6 +12,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -44,11 +45,11 @@ class Counter:
     def __init__(self):
         self.evaluations = 0
 
-    def watch(self, fun: Callable[[Y], jax.Array]) -> Callable[[Y], jax.Array]:
+    def watch(self, fun: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
         """The same function of y, counted: one for each y, whatever the size of the value."""
 
-        def counted(y: Y) -> jax.Array:
-            value = fun(y)
+        def counted(*y: Y) -> jax.Array:
+            value = fun(*y)
             out = jax.ShapeDtypeStruct(value.shape, value.dtype)
             let_pass = functools.partial(self._let_pass, size=value.size)
             return jax.pure_callback(let_pass, out, value, vmap_method="expand_dims")
@@ -125,7 +126,7 @@ def run(
     *,
     setting: str,
     fresh: bool = False,
-    progress: bool = True,
+    progress: bool | tqdm = True,
 ) -> dict[Method, list[Run] | NotAble]:
     """Runs each method from each start, unless its file is there and is still valid.
 
@@ -139,7 +140,7 @@ def run(
         folder: Where the files of the runs are.
         setting: "quick" or "full", a part of their names.
         fresh: Run again what has been run.
-        progress: Show a bar.
+        progress: Show a bar, or go on with this one.
 
     Returns:
         The runs of each method, or why it is not able.
@@ -164,10 +165,7 @@ def run(
 
     runs: dict[Method, list[Run]] = {method: [] for method in methods}
     not_able: dict[Method, NotAble] = {}
-    with (
-        precision_of(task),
-        tqdm(total=len(methods) * seeds, disable=not progress, unit="run") as bar,
-    ):
+    with precision_of(task), _bar(progress, len(methods) * seeds) as bar:
         behaviour = _behaviour(task)
         for seed, method in itertools.product(range(seeds), methods):
             bar.set_description(f"{task.name}: start {seed}, {method.name}")
@@ -180,12 +178,21 @@ def run(
     return runs | not_able
 
 
+def _bar(progress: bool | tqdm, runs: int) -> AbstractContextManager[tqdm]:
+    if isinstance(progress, tqdm):
+        return nullcontext(progress)
+    return tqdm(total=runs, disable=not progress, unit="run")
+
+
 def _watched(task: Task, counter: Counter) -> Task:
     """The task as the methods see it: whatever evaluates it is counted."""
     watched: dict[str, Any] = {"loss": counter.watch(task.loss)}
     for name in ("residuals", "terms"):
         if (fun := getattr(task, name)) is not None:
             watched[name] = counter.watch(fun)
+    if (grey := task.grey) is not None:
+        watched["grey"] = grey._replace(black=counter.watch(grey.black))
+        watched["loss"] = watched["grey"].loss
     if (native_ad := task.native_ad) is not None:
         watched["native_ad"] = lambda: counter.watch_native_ad(native_ad())
     return dataclasses.replace(task, **watched)
@@ -245,6 +252,9 @@ def _solve(task: Task, solve: Solve, seed: int, counter: Counter, exact_loss: Lo
 
 def _distances(task: Task, unravel: Callable, ys: Sequence[np.ndarray], sought) -> np.ndarray:
     """How far each point is from the y that is sought, or how many entries are wrong."""
+    if task.distance is not None:
+        distance = jax.jit(task.distance)
+        return np.array([float(distance(unravel(y))) for y in ys])
     if task.discrete is None:
         return np.linalg.norm(np.asarray(ys, float) - sought.astype(float), axis=1)
     read = jax.jit(task.discrete)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 
 from benchmarks import _harness, methods
 from benchmarks._task import Budget, NotAble, Task, precision_of
@@ -31,7 +32,9 @@ EXPECTED = {
     "annealing": (600, 1e-2, 1),
     "genetic_algorithm": (600, 1e-2, 99),
     "spsa": (600, 1e-2, 5 * 2),
+    "first_order": (600, 1e-2, 8),
     "zerograds": (600, 1e-2, 2),
+    "optax_perturbations": (600, 1e-2, 4),
     # the slope that sets the unit, then the value and the gradient of the first step
     "optimistix_bfgs": (200, 1e-6, 4 + 1 + 4),
     "jaxopt_lbfgs": (1600, 1e-2, None),
@@ -109,6 +112,65 @@ def test_progress_bounds_and_counts(name):
     assert np.all((np.asarray(run["found"]) >= LOW) & (np.asarray(run["found"]) <= HIGH))
     if first is not None:
         assert run["evaluations"][1] == first
+
+
+def stairs(evaluations: int) -> Task:
+    """Many parameters, each with a valley of its own in steps, and a wrong one at its far end."""
+    reference = {"a": jnp.linspace(0.2, 0.8, 120), "b": jnp.full((2, 3), 0.3)}
+    vector = lambda y: ravel_pytree(y)[0]
+
+    def terms(y):
+        away = jnp.abs(vector(y) - vector(reference))
+        return jnp.floor(100 * jnp.where(away > 0.6, 1.2 - away, away)) ** 2
+
+    return Task(
+        name="stairs",
+        title="Stairs",
+        loss=lambda y: terms(y).sum(),
+        exact_loss=lambda y: terms(y).sum(),
+        start=lambda seed: jax.tree.map(
+            lambda leaf: jax.random.uniform(jax.random.key(seed), leaf.shape), reference
+        ),
+        reference=reference,
+        bounds=({"a": jnp.array(0.0), "b": jnp.array(0.0)}, jax.tree.map(jnp.ones_like, reference)),
+        sigma=0.1,
+        budget=Budget(evaluations, 60),
+        seeds=1,
+        terms=terms,
+        support=vector,
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "evaluations", "left", "batch"),
+    [
+        ("local_cross_entropy", 320, 1e-3, 32),
+        ("local_gradient", 480, 0.02, 8),
+        ("cma_es_diagonal", 2000, 0.2, 18),
+    ],
+)
+def test_many_parameters(name, evaluations, left, batch):
+    task = stairs(evaluations)
+    counter = _harness.Counter()
+    watched = _harness._watched(task, counter)
+    solve = methods.load(name).prepare(watched)
+    run = _harness._solve(watched, solve, 0, counter, task.exact_loss)
+    assert run["image_error"][-1] <= left
+    assert run["evaluations"][1] == batch
+    assert evaluations <= run["evaluations"][-1] < evaluations + batch
+    found = np.asarray(run["found"])
+    assert np.all((found >= 0) & (found <= 1))
+
+
+@pytest.mark.parametrize("name", ["local_cross_entropy", "local_gradient", "cma_es_diagonal"])
+def test_methods_for_many_parameters_say_what_they_need(name):
+    with pytest.raises(NotAble, match=r"parameters or more|local support"):
+        methods.load(name).prepare(bowl()[0])
+
+
+def test_lists_of_methods_name_methods():
+    for chosen in (methods.QUICK, methods.MANY_PARAMETERS, methods.PROGRAMS):
+        assert set(chosen) <= set(methods.METHODS)
 
 
 @pytest.mark.parametrize("name", ["cma_es", "optimistix_bfgs", "newton"])

@@ -16,6 +16,7 @@ METHODS = {
     "finite_differences": "benchmarks.methods.finite_differences",
     "fr22": "benchmarks.methods.fr22",
     "cma_es": "benchmarks.methods.cma_es",
+    "cma_es_diagonal": "benchmarks.methods.cma_es_diagonal",
     "mitsuba_ad": "benchmarks.methods.mitsuba_ad",
     "evosax_snes": "benchmarks.methods.evosax_snes",
     "nelder_mead": "benchmarks.methods.scipy_local",
@@ -24,6 +25,7 @@ METHODS = {
     "annealing": "benchmarks.methods.annealing",
     "genetic_algorithm": "benchmarks.methods.genetic_algorithm",
     "spsa": "benchmarks.methods.spsa",
+    "optax_perturbations": "benchmarks.methods.optax_perturbations",
     "optimistix_bfgs": "benchmarks.methods.optimistix_bfgs",
     "jaxopt_lbfgs": "benchmarks.methods.jaxopt_lbfgs",
     "our_gradient": "benchmarks.methods.our_gradient",
@@ -37,6 +39,14 @@ METHODS = {
     "bfgs_wolfe": "benchmarks.methods.quasi_newton",
     "bfgs_damped": "benchmarks.methods.quasi_newton",
     "bfgs_adaptive": "benchmarks.methods.adaptive_differences",
+    "first_order": "benchmarks.methods.first_order",
+    "local_gradient": "benchmarks.methods.local_gradient",
+    "local_cross_entropy": "benchmarks.methods.local_cross_entropy",
+    "grey_differences": "benchmarks.methods.grey_box",
+    "grey_fr22": "benchmarks.methods.grey_box",
+    "grey_our_gradient": "benchmarks.methods.grey_box",
+    "grey_aggregate": "benchmarks.methods.grey_box",
+    "grey_ours": "benchmarks.methods.grey_box",
     "zerograds": "benchmarks.methods.zerograds",
     "newton_cg": "benchmarks.methods.newton_cg",
     "gauss_newton": "benchmarks.methods.gauss_newton",
@@ -52,6 +62,43 @@ QUICK = (
     "newton_cg",
     "gauss_newton",
 )
+
+# what runs on the scenes of the report: also what else people use, and what else was published
+SCENES = (
+    "finite_differences",
+    "spsa",
+    "fr22",
+    "our_gradient",
+    "our_hvpa",
+    "zerograds",
+    "cma_es",
+    "genetic_algorithm",
+    "annealing",
+    "nelder_mead",
+    "optimistix_bfgs",
+    "jaxopt_lbfgs",
+    "optax_perturbations",
+    "mitsuba_ad",
+    "first_order",
+    "newton_cg",
+    "gauss_newton",
+)
+
+# what runs on programs of the ZeroGrads paper: what it compares with, and ours
+MANY_PARAMETERS = (
+    "fr22",
+    "spsa",
+    "cma_es_diagonal",
+    "evosax_snes",
+    "genetic_algorithm",
+    "annealing",
+    "zerograds",
+    "first_order",
+    "local_gradient",
+    "local_cross_entropy",
+)
+# and what takes more for each step, or more memory than a vector, the more parameters there are
+PROGRAMS = ("finite_differences", "cma_es", *MANY_PARAMETERS, "newton_cg")
 
 
 def load(name: str) -> Method:

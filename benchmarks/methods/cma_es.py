@@ -32,6 +32,8 @@ def prepare(task: Task) -> Solve:
                 "popsize": population * 2**restart,
                 "verbose": -9,
             }
+            if flat.size == 1:
+                options["maxstd"] = np.inf  # pycma 4 raises where it would cut the width in 1-D
             search = cma.CMAEvolutionStrategy(start, task.sigma, options)
             while not search.stop():
                 points = search.ask()

@@ -8,12 +8,13 @@ import logging
 import jax
 import numpy as np
 
-from benchmarks._task import Solve, Task
+from benchmarks._task import NotAble, Solve, Task
 from benchmarks.methods._flat import Flat, package
 
 TITLE = "Genetic algorithm (PyGAD)"
 POPULATION = 50
 PARENTS = 10
+MOST = 100_000  # parameters: PyGAD goes through them one by one
 SILENT = logging.Logger("silent", logging.CRITICAL + 1)  # it would log how record ends a run
 
 
@@ -21,6 +22,8 @@ def prepare(task: Task) -> Solve:
     """Evaluates a whole generation in one call."""
     pygad = package("pygad", "pygad")
     flat = Flat(task)
+    if flat.size > MOST:
+        raise NotAble(f"takes minutes for a generation of more than {MOST} parameters")
 
     def solve(y0, key, record):
         seed = int(jax.random.randint(key, (), 1, 2**31 - 1))
