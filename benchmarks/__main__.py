@@ -1,7 +1,6 @@
-"""The command line: `python -m benchmarks list | run TASK... | overhead | filters | ...`."""
+"""The command line: `python -m benchmarks list | run TASK... | report | overhead | ...`."""
 
 import argparse
-import json
 import sys
 from pathlib import Path
 
@@ -9,7 +8,8 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks import methods, tasks
-from benchmarks._task import NotAble, Task
+from benchmarks._run import run_one, run_scenes
+from benchmarks._task import NotAble
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -21,7 +21,9 @@ def main(arguments: list[str] | None = None, results: Path = RESULTS) -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("list", help="name the tasks and the methods")
     run = commands.add_parser("run", help="run methods on tasks; what has been run is kept")
-    run.add_argument("tasks", nargs="+", metavar="TASK", choices=tasks.TASKS)
+    run.add_argument(
+        "tasks", nargs="+", metavar="TASK", choices=[*tasks.TASKS, "all"], help="or all: the scenes"
+    )
     run.add_argument("--full", action="store_true", help="every start, at full size")
     run.add_argument("--seeds", type=int, metavar="N", help="number of starts")
     run.add_argument("--methods", metavar="A,B", help="these, separated by commas")
@@ -31,20 +33,44 @@ def main(arguments: list[str] | None = None, results: Path = RESULTS) -> None:
     errors = commands.add_parser("variance", help="errors of derivatives, for what they cost")
     errors.add_argument("--full", action="store_true", help="every estimator and problem")
     errors.add_argument("--fresh", action="store_true", help="measure again, as the code changed")
+    study = commands.add_parser("zerograds", help="the tables and figures of the ZeroGrads paper")
+    study.add_argument("--full", action="store_true", help="ten starts, longer runs, more samples")
+    study.add_argument("--fresh", action="store_true", help="run again what has been run")
     commands.add_parser("stress", help="stiff and extreme cases: expected, seen, verdict")
+    page = commands.add_parser("report", help="report.html, from the results of the scenes")
+    page.add_argument("tasks", nargs="*", metavar="TASK", help="these; all scenes by default")
+    robustness = commands.add_parser("robustness", help="starts, samples, render noise, JPEG")
+    robustness.add_argument("--full", action="store_true", help="more starts")
     options = parser.parse_args(arguments)
     command = " ".join(["python -m benchmarks", *arguments])
 
     if options.command == "list":
         _list()
     elif options.command == "run":
+        if "all" in options.tasks:
+            run_scenes(options, results, command)
         for task in options.tasks:
-            _run(task, options, results / task, command)
+            if task != "all":
+                _run(task, options, results / task, command)
     elif options.command == "variance":
         from benchmarks import variance
 
         setting = variance.FULL if options.full else variance.QUICK
         variance.main(results / "variance", setting, command=command, fresh=options.fresh)
+    elif options.command == "report":
+        from benchmarks import report
+
+        report.main(results, options.tasks)
+    elif options.command == "robustness":
+        from benchmarks import robustness
+
+        setting = robustness.FULL if options.full else robustness.QUICK
+        robustness.main(results / "robustness", command, setting=setting)
+    elif options.command == "zerograds":
+        from benchmarks import zerograds
+
+        size = zerograds.FULL if options.full else zerograds.QUICK
+        zerograds.main(results / "zerograds", size, command=command, fresh=options.fresh)
     elif options.command == "stress":
         from benchmarks import stress
 
@@ -59,6 +85,13 @@ def main(arguments: list[str] | None = None, results: Path = RESULTS) -> None:
         overhead.main(results / "overhead")
 
 
+def _run(name: str, options: argparse.Namespace, folder: Path, command: str) -> None:
+    try:
+        run_one(name, options, folder, command)
+    except NotAble as reason:
+        Console().print(f"{name} is not able here: {reason}.")
+
+
 def _list() -> None:
     for title, names, load in (
         ("Tasks", tasks.TASKS, tasks.module),
@@ -69,54 +102,6 @@ def _list() -> None:
             found = load(name)
             shown.add_row(name, getattr(found, "TITLE", None) or found.title)
         Console().print(shown)
-
-
-def _run(name: str, options: argparse.Namespace, folder: Path, command: str) -> None:
-    from benchmarks import _family, _report, descents
-
-    module = tasks.module(name)
-    try:
-        built = module.build(options.full)
-    except NotAble as reason:
-        Console().print(f"{name} is not able here: {reason}.")
-        return
-    first = built[0] if isinstance(built, list) else built
-    if isinstance(first, descents.Descent):
-        descents.run(built, options, folder, command)
-        return
-    console = Console()
-    if isinstance(built, list):
-        members = [_run_task(task, options, folder / task.name, command) for task in built]
-        results = _family.summarise(module.TITLE, members)
-        _family.draw(results, folder / "evaluations.png")
-        shown = _family.tables(results)
-    else:
-        results = _run_task(built, options, folder, command)
-        shown = _report.tables(results)
-    (folder / "results.json").write_text(json.dumps(results, indent=1) + "\n")
-    console.print(shown)
-    console.print(f"Written to {folder}")
-
-
-def _run_task(task: Task, options: argparse.Namespace, folder: Path, command: str) -> dict:
-    from benchmarks import _report, _summary
-    from benchmarks._harness import run
-
-    setting = "full" if options.full else "quick"
-    usual = methods.METHODS if options.full else methods.QUICK
-    chosen = options.methods.split(",") if options.methods else usual
-    found = run(
-        task,
-        [methods.load(method) for method in chosen],
-        options.seeds or task.seeds,
-        folder / "runs",
-        setting=setting,
-        fresh=options.fresh,
-    )
-    folder.mkdir(parents=True, exist_ok=True)
-    results = _summary.summarise(task, found, setting, command)
-    _report.write(task, results, folder)
-    return results
 
 
 if __name__ == "__main__":

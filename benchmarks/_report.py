@@ -57,21 +57,7 @@ def _curves(results: dict[str, Any], cost: str, path: Path) -> None:
     methods, look, errors = able(results), looks(results["methods"]), errors_of(results)
     with figure(path, 1, len(errors), (4.5 * len(errors), 3.8)) as (drawn, axes):
         for axis, error in zip(axes[0], errors, strict=True):
-            lowest, highest = 0.1, 1.0
-            for name, found in methods.items():
-                runs = found["runs"]
-                costs = np.concatenate([run[cost] for run in runs])
-                if not costs.any():  # it gave up at once
-                    continue
-                grid = np.geomspace(costs[costs > 0].min(), costs.max(), 200)
-                low, middle, high = np.maximum(band(runs, error, cost, grid), FLOORS[error])
-                axis.plot(grid, middle, label=found["title"], **look[name])
-                axis.fill_between(grid, low, high, color=look[name]["color"], alpha=0.15, lw=0)
-                lowest, highest = min(lowest, low.min()), max(highest, high.max())
-            axis.set(ylim=(lowest / 1.3, highest * 1.3))
-            axis.set(xscale="log", yscale="log", xlabel=LABELS[cost], title=LABELS[error])
-            for level in (level for level in LEVELS[error].values() if level >= lowest):
-                axis.axhline(level, color="0.6", lw=0.6, ls=":", zorder=0)
+            panel(axis, methods, look, error, cost)
         starts = max(found["starts"] for found in methods.values())
         handles, labels = axes[0, 0].get_legend_handles_labels()
         legend(drawn, handles, labels)
@@ -81,6 +67,25 @@ def _curves(results: dict[str, Any], cost: str, path: Path) -> None:
             ha="left",
             fontsize=10,
         )
+
+
+def panel(axis, methods: dict[str, Any], look: dict[str, dict], error: str, cost: str) -> None:
+    """Median and quartiles of one error over the starts, against what they cost."""
+    lowest, highest = 0.1, 1.0
+    for name, found in methods.items():
+        runs = found["runs"]
+        costs = np.concatenate([run[cost] for run in runs])
+        if not costs.any():  # it gave up at once
+            continue
+        grid = np.geomspace(costs[costs > 0].min(), costs.max(), 200)
+        low, middle, high = np.maximum(band(runs, error, cost, grid), FLOORS[error])
+        axis.plot(grid, middle, label=found["title"], **look[name])
+        axis.fill_between(grid, low, high, color=look[name]["color"], alpha=0.15, lw=0)
+        lowest, highest = min(lowest, low.min()), max(highest, high.max())
+    axis.set(ylim=(lowest / 1.3, highest * 1.3))
+    axis.set(xscale="log", yscale="log", xlabel=LABELS[cost], title=LABELS[error])
+    for level in (level for level in LEVELS[error].values() if level >= lowest):
+        axis.axhline(level, color="0.6", lw=0.6, ls=":", zorder=0)
 
 
 def _images(task: Task, results: dict[str, Any], path: Path) -> None:

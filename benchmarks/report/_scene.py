@@ -1,0 +1,96 @@
+"""A scene's results as the report reads them, and which method is ours there.
+
+Ours is one rule, set before anything was run, and not what came out best: least squares where there
+are residuals, and a support where parameters act locally, as README advises.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from benchmarks import methods, tasks
+from benchmarks._report import able
+
+FEW = 300  # parameters
+# in this order, and up to how many parameters; one that needs what a task lacks does not run on it
+RULE = {
+    "grey_ours": None,
+    "gauss_newton": FEW,
+    "local_gradient": None,
+    "newton_cg": FEW,
+    "first_order": None,
+}
+OURS = (*RULE, "local_cross_entropy")  # all that are no rivals of ours
+RULE_TEXT = (
+    "Ours is grey_ours where AD knows a part of the task; else gauss_newton where the task"
+    f" has residuals and at most {FEW} parameters; else "
+    "local_gradient where the task has a local support; else newton_cg up to as many "
+    "parameters; else first_order. Each with one setting for all scenes."
+)
+LEVELS = ("90", "99", "99.9")
+ERRORS = ("image_error", "parameter_error")
+COSTS = ("evaluations", "seconds")
+# an optimiser gets stuck there, or not: by what is seen of what is sought from the starts
+NO_PLATEAU = ("bunny", "texture32", "suzanne", "banana", "caustic", "glass-ball", "brdf", "quad")
+
+
+class Reached(NamedTuple):
+    """What a level took: the median over the starts, None where no more than half got there."""
+
+    median: float | None
+    solved: int
+    starts: int
+
+
+class Scene(NamedTuple):
+    """One scene; `results` is its results.json."""
+
+    name: str
+    results: dict[str, Any]
+
+    @property
+    def ran(self) -> dict[str, Any]:
+        """The methods that were able, in the order of all methods."""
+        found = able(self.results)
+        return {name: found[name] for name in methods.METHODS if name in found}
+
+    @property
+    def ours(self) -> str | None:
+        """By the rule; None where none of ours was run."""
+        size = self.results["dimensions"]
+        allowed = (name for name, most in RULE.items() if most is None or size <= most)
+        return next((name for name in allowed if name in self.ran), None)
+
+    @property
+    def plateau(self) -> bool:
+        return self.name not in NO_PLATEAU
+
+    def reached(self, method: str, error: str, level: str, cost: str) -> Reached:
+        """What a method took to a level, in evaluations or seconds."""
+        found = self.ran[method]
+        at = found[error]["levels"][level]
+        return Reached(at[cost]["median"], at["solved"], found["starts"])
+
+    def ratio(self, method: str, to: str | None, error: str, level: str, cost: str) -> float | None:
+        """How many times as long as `to` a method took; None where one of them did not get there.
+
+        A level that is reached at once, as where the start is solved, gives no ratio.
+        """
+        if to not in self.ran or method not in self.ran:
+            return None
+        one, other = (self.reached(name, error, level, cost).median for name in (method, to))
+        return one / other if one and other else None
+
+
+def names(asked: Sequence[str]) -> list[str]:
+    """The tasks that were asked for, or all scenes."""
+    return list(asked or tasks.ALL_SCENES)
+
+
+def title(method: str, scenes: Sequence[Scene]) -> str:
+    """The title of a method, as it was when it ran."""
+    return next(scene.ran[method]["title"] for scene in scenes if method in scene.ran)
+
+
+def all_methods(scenes: Sequence[Scene]) -> list[str]:
+    """All that ran on any scene, in one order."""
+    return [name for name in methods.METHODS if any(name in scene.ran for scene in scenes)]
