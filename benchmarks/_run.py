@@ -14,6 +14,7 @@ from benchmarks import methods, tasks
 from benchmarks._task import Method, NotAble, Solve, Task
 
 STARTS = {"quick": 5, "full": 20}  # of most scenes: a guess, for the bar only
+LONGEST = 20_000  # parameters; more are in the pictures and in the files of the runs only
 
 
 def run_one(
@@ -126,6 +127,10 @@ def _run_task(
 
 def _write(folder: Path, results: dict) -> None:
     """Writes all or nothing: a report may be made at any time."""
+    for found in results.get("methods", {}).values():
+        for run in found.get("runs", []):
+            if len(run["found"]) > LONGEST:
+                del run["found"]
     temporary = folder / "results.tmp"
     temporary.write_text(json.dumps(results, indent=1) + "\n")
     temporary.replace(folder / "results.json")

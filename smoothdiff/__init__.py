@@ -5,6 +5,7 @@ from smoothdiff._aggregate import Aggregate
 from smoothdiff._baselines import AbstractBaseline
 from smoothdiff._black_box import black_box
 from smoothdiff._call import Options
+from smoothdiff._control_variate import control_variate
 from smoothdiff._filtered_adam import filter_updates, filtered_adam, scale_by_filtered_adam
 from smoothdiff._gp import GaussianProcess
 from smoothdiff._host_calls import BlackBoxError
@@ -12,6 +13,7 @@ from smoothdiff._importance import Importance, difference_hvp
 from smoothdiff._large_steps import large_steps
 from smoothdiff._least_squares import LeastSquares
 from smoothdiff._minimise import MinimiseError, Record, Result, least_squares, minimise
+from smoothdiff._newton_step import newton_step
 from smoothdiff._quadratic import HessianOperator, QuadraticModel
 from smoothdiff._samplers import AbstractSampler, Gaussian, Noise, Orthogonal, Sobol, Uniform
 from smoothdiff._smooth import smooth, smooth_grad, smooth_jacobian, smooth_value_and_grad
@@ -48,6 +50,7 @@ __all__ = [
     "Uniform",
     "ZeroGrads",
     "black_box",
+    "control_variate",
     "difference_hvp",
     "filter_updates",
     "filtered_adam",
@@ -58,6 +61,7 @@ __all__ = [
     "local_support",
     "matrix_support",
     "minimise",
+    "newton_step",
     "probe_support",
     "scale_by_filtered_adam",
     "smooth",

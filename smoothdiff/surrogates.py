@@ -12,6 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from smoothdiff._select import Selection, select
+
+__all__ = ["MLP", "Quadratic", "Selection", "select"]
+
 
 class MLP(eqx.Module):
     r"""A fully connected network, optionally behind a positional encoding.

@@ -1,12 +1,14 @@
 """Surrogates: their shapes, closed forms and initial weights."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from smoothdiff.surrogates import MLP, Quadratic
+from smoothdiff.surrogates import MLP, Quadratic, select
 
 KEY = jax.random.key(3)
 
@@ -54,3 +56,54 @@ def test_keys_draw_the_weights():
     same = [weights(MLP(4, key=jax.random.key(i))) for i in (0, 0, 1)]
     np.testing.assert_array_equal(same[0][0], same[1][0])
     assert not jnp.array_equal(same[0][0], same[2][0])
+
+
+# the choice by held-out error
+
+
+def linear(size, *, key):
+    return eqx.nn.Linear(size, "scalar", key=key)
+
+
+CANDIDATES = [linear, functools.partial(MLP, width=32, depth=1, activation=jnp.tanh)]
+POINTS = jax.random.normal(jax.random.key(7), (300, 2))
+
+
+def test_a_linear_function_needs_the_smallest():
+    noise = 0.3 * jax.random.normal(jax.random.key(8), (300,))
+    values = 100 + POINTS @ jnp.array([1.0, -2.0]) + noise
+    selection = select(CANDIDATES, POINTS, values, key=KEY)
+    assert selection.surrogate is linear
+    # what is left is the noise's share of the variance
+    share = 0.09 / (5 + 0.09)
+    assert abs(selection.errors[0] - share) < 4 * selection.stderrs[0]
+
+
+def test_a_wiggly_one_needs_more():
+    values = jnp.sin(2 * POINTS[:, 0]) * jnp.cos(POINTS[:, 1])
+    selection = select(CANDIDATES, POINTS, values, key=KEY)
+    assert selection.surrogate is CANDIDATES[1]
+    assert selection.errors[1] < 0.5 * selection.errors[0]
+
+
+def test_any_module_is_a_candidate():
+    curved = jnp.sum(POINTS**2, axis=1)
+    selection = select([linear, Quadratic], POINTS, curved, key=KEY, steps=2000)
+    assert selection.surrogate is Quadratic
+    assert selection.errors[1] < 1e-2
+
+
+@pytest.mark.parametrize(
+    ("candidates", "values", "settings", "match"),
+    [
+        ([], jnp.ones(300), {}, "at least one"),
+        (CANDIDATES, jnp.ones(299), {}, "one value for each"),
+        (CANDIDATES, jnp.ones(300).at[3].set(jnp.nan), {}, "finite"),
+        (CANDIDATES, jnp.ones(300), {"held_out": 0.0}, "held_out"),
+        (CANDIDATES, jnp.ones(300), {"held_out": 1.0}, "held_out"),
+    ],
+    ids=["none", "lengths", "nan", "nothing held out", "all held out"],
+)
+def test_what_cannot_be_compared_is_refused(candidates, values, settings, match):
+    with pytest.raises(ValueError, match=match):
+        select(candidates, POINTS, values, key=KEY, **settings)

@@ -14,8 +14,10 @@ from jax.flatten_util import ravel_pytree
 
 import smoothdiff as sd
 from smoothdiff._params import take_apart
+from smoothdiff._solvers._locality import share
+from smoothdiff._solvers._replay import Replay
 from smoothdiff._solvers._surrogate_fit import surrogate_loss
-from smoothdiff._solvers.zerograds import ZeroGrads, _share
+from smoothdiff._solvers.zerograds import ZeroGrads
 from smoothdiff.surrogates import MLP, Quadratic
 
 KEY = jax.random.key(2)
@@ -24,6 +26,8 @@ SMALL = functools.partial(MLP, width=16, depth=1, activation=jnp.tanh)
 # large steps on a small network: a test has no time for a careful fit
 QUICK: dict[str, Any] = {
     "surrogate": SMALL,
+    "surrogate_steps": 3,
+    "replay": 5,
     "surrogate_optimizer": optax.adam(0.01),
     "optimizer": optax.adam(0.01),
 }
@@ -103,12 +107,13 @@ def test_the_gradient_of_the_surrogate_is_unbiased(place, surrogate, how, x64):
     params, step = take_apart(theta, SIGMA, None), jnp.asarray(0)
 
     def estimate(key):
-        fn = lambda y, args: (jumps(y), None)
-        rho, batch = solver._sampled(fn, theta, None, params, step, {"key": key})
+        fn = lambda y: (jumps(y), None)
+        locality = solver._locality(params, theta, step, {"key": key})
+        rho, batch = locality.around(fn)
 
         def loss(weights):
             made = eqx.combine(weights, rest)
-            return surrogate_loss(made, rho, batch.values, _share(batch), up_to_constant)
+            return surrogate_loss(made, rho, batch.values, share(batch), up_to_constant)
 
         return ravel_pytree(jax.grad(loss)(weights))[0]
 
@@ -124,14 +129,47 @@ def test_the_gradient_of_the_surrogate_is_unbiased(place, surrogate, how, x64):
 
 
 def test_pairs_mirror_both_kernels_together():
-    seen = []
     solver = ZeroGrads(SIGMA, inner_sigma=INNER, num_samples=6)
-    fn = lambda y, args: (seen.append(y) or bowl(y, TARGET), None)
+    fn = lambda y: (bowl(y, TARGET), None)
     params = take_apart(jnp.asarray(THETA, jnp.float32), SIGMA, None)
-    with jax.disable_jit():
-        rho, _ = solver._sampled(fn, params.theta, None, params, jnp.asarray(0), {"key": KEY})
+    locality = solver._locality(params, params.theta, jnp.asarray(0), {"key": KEY})
+    rho, _ = locality.around(fn)
     middle = (rho[0::2] + rho[1::2]) / 2
     np.testing.assert_allclose(middle, np.tile(params.theta, (3, 1)), atol=1e-6)
+
+
+def test_replayed_samples_stand_for_the_present_neighbourhood():
+    """Weighted by the ratio of densities they have its moments; a weight is at most a share."""
+    old, new, width = (jnp.array([v]) for v in (0.3, 0.0, 1.0))
+    u = old[None] + 2 * jax.random.normal(KEY, (20_000, 1))
+    density = lambda u, center, width: -(((u - center) / width) ** 2).sum() / 2 - jnp.log(width)[0]
+    drawn = jax.vmap(lambda u: density(u, old, 2 * width))(u)
+    share = jnp.full(len(u), 1 / len(u))
+    replay = Replay.start(2, len(u), old, jnp.float32).after(
+        jnp.asarray(0), u, u[:, 0], share, drawn
+    )
+    now = jax.vmap(jax.vmap(lambda u: density(u, new, width)))(replay.u)
+    # no cap is met where the present density is lower than the other by a factor
+    weights = replay.weights(now - 5)
+    np.testing.assert_allclose(jnp.sum(weights), 1, rtol=1e-5)
+    np.testing.assert_array_equal(weights[1], 0)
+    mean = jnp.sum(weights[0] * u[:, 0])
+    np.testing.assert_allclose(mean, 0, atol=0.05)
+    np.testing.assert_allclose(jnp.sum(weights[0] * u[:, 0] ** 2), 1, atol=0.1)
+    capped = replay.weights(now)
+    assert jnp.max(capped) <= 1.01 * jnp.min(capped[0][drawn <= now[0]])
+
+
+def test_the_newest_batch_has_its_shares_and_the_oldest_goes():
+    u, share = jnp.ones((2, 3)), jnp.full(2, 0.5)
+    replay = Replay.start(2, 2, u[0], jnp.float32)
+    for step in range(3):
+        values = jnp.full(2, float(step))
+        replay = replay.after(jnp.asarray(step), u * step, values, share, jnp.zeros(2))
+    np.testing.assert_array_equal(replay.values[:, 0], [2, 1])
+    np.testing.assert_allclose(replay.weights(jnp.zeros((2, 2))), jnp.full((2, 2), 0.25))
+    far = jnp.array([[0.0, 0.0], [-1e4, -1e4]])
+    np.testing.assert_allclose(replay.weights(far), [[0.5, 0.5], [0, 0]])
 
 
 # what it finds
@@ -156,6 +194,7 @@ def test_crosses_plateaus_in_both_precisions(dtype):
         {"sampler": sd.Sobol(), "num_samples": 4},
         {"log": True},
         {"surrogate_steps": 1, "parameter_steps": 2},
+        {"replay": 0, "up_to_constant": True},
     ],
     ids=names,
 )
@@ -169,9 +208,9 @@ def test_without_locality_it_samples_all_that_is_within_the_bounds():
     solver = ZeroGrads(0.1, local=False, num_samples=2000)
     y, bounds = jnp.array([0.5, 3.0]), (low, high)
     params = take_apart(y, 0.1, bounds)
-    fn = lambda y, args: (bowl(y, TARGET), None)
+    fn = lambda y: (bowl(y, TARGET), None)
     options = {"key": KEY, "bounds": bounds}
-    rho, _ = solver._sampled(fn, y, None, params, jnp.asarray(0), options)
+    rho, _ = solver._locality(params, y, jnp.asarray(0), options).around(fn)
     assert jnp.all((low[None] < rho) & (rho < high[None]))
     share = (rho - low[None]) / (high - low)[None]
     np.testing.assert_allclose(jnp.mean(share, axis=0), 0.5, atol=1e-6)
@@ -346,6 +385,7 @@ def test_a_failed_step_keeps_everything_and_says_so():
         ({"num_samples": 1, "sampler": sd.Gaussian()}, "up_to_constant=False"),
         ({"surrogate_steps": 0}, "surrogate_steps"),
         ({"parameter_steps": 0}, "parameter_steps"),
+        ({"replay": -1}, "replay"),
         ({"local": False}, "bounds"),
         ({"sampler": sd.Uniform()}, "weights"),
     ],

@@ -1,6 +1,7 @@
 """The fit of a surrogate to batches of values: what it learns from them, and in which units."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,9 +10,31 @@ import optax
 from jaxtyping import Array, Float, Int, PyTree
 
 from smoothdiff._solvers._base import promotion
+from smoothdiff._solvers._replay import Replay
 
 # the share of the newest batch in the running level and spread of the values
 _NEWEST = 0.1
+
+
+class Settings(NamedTuple):
+    """How a surrogate is fitted; the names are those of `ZeroGrads`."""
+
+    surrogate_steps: int
+    replay: int
+    up_to_constant: bool
+
+    @staticmethod
+    def default(size: int, **given: int | None) -> "Settings":
+        """What is given, and else what is best for so many parameters."""
+        default = _OF_FEW if size <= _FEW else _OF_MANY
+        return default._replace(**{name: g for name, g in given.items() if g is not None})
+
+
+# with few parameters, earlier batches are still near, and a fit to many points shows more than a
+# slope; with many, they are not, and a closer fit to the newest ones is one to their noise
+_FEW = 50
+_OF_FEW = Settings(surrogate_steps=10, replay=100, up_to_constant=False)
+_OF_MANY = Settings(surrogate_steps=3, replay=0, up_to_constant=True)
 
 
 class Fit(eqx.Module):
@@ -22,6 +45,7 @@ class Fit(eqx.Module):
 
     weights: PyTree
     opt_state: PyTree
+    replay: Replay
     origin: Float[Array, " n"]
     unit: Float[Array, " n"]
     level: Float[Array, ""]
@@ -29,10 +53,12 @@ class Fit(eqx.Module):
     first_spread: Float[Array, ""]
 
     @staticmethod
-    def start(weights: PyTree, opt_state: PyTree, origin: Array, unit: Array, dtype) -> "Fit":
+    def start(
+        weights: PyTree, opt_state: PyTree, replay: Replay, origin: Array, unit: Array, dtype
+    ) -> "Fit":
         """Nothing learnt yet."""
         zero = jnp.zeros((), dtype)
-        return Fit(weights, opt_state, origin, unit, zero, zero, zero)
+        return Fit(weights, opt_state, replay, origin, unit, zero, zero, zero)
 
     def height(self, surrogate: Callable[[Array], Array], x: Float[Array, " n"]) -> Array:
         """The surrogate at a point, in units of the first batch's spread.
@@ -42,6 +68,11 @@ class Fit(eqx.Module):
         slope = self.spread / _positive(self.first_spread)
         return slope * surrogate((x - self.origin) / self.unit).astype(slope.dtype)
 
+    def value(self, surrogate: Callable[[Array], Array], x: Float[Array, " n"]) -> Array:
+        """The surrogate at a point, in units of the values."""
+        unit = surrogate((x - self.origin) / self.unit).astype(self.spread.dtype)
+        return self.level + self.spread * unit
+
     def updated(
         self,
         rest: PyTree,
@@ -50,11 +81,14 @@ class Fit(eqx.Module):
         share: Float[Array, " N"],
         step: Int[Array, ""],
         *,
-        num_updates: int,
+        log_density: Callable[[Array], Array],
+        settings: Settings,
         optimizer: optax.GradientTransformation,
-        up_to_constant: bool,
     ) -> "Fit":
-        """The fit after some updates on one batch; `rest` is what of the surrogate is no weight."""
+        """The fit after some updates on the newest batch and on those that are replayed.
+
+        `rest` is what of the surrogate is no weight; `log_density(rho)` is that of the samples.
+        """
         weighted = share.astype(values.dtype)
         mean = jnp.sum(weighted * values)
         newest = jnp.maximum(_NEWEST, 1 / (step + 1).astype(values.dtype))
@@ -65,11 +99,18 @@ class Fit(eqx.Module):
         # the scale of earlier batches, so that it does not depend on the samples that it is used on
         seen_level = jnp.where(step == 0, level, self.level)
         seen_spread = jnp.where(step == 0, spread, self.spread)
-        goal = ((values - seen_level) / _positive(seen_spread)).astype(rho.dtype)
         u = (rho - self.origin[None]) / self.unit[None]
+        density = lambda u: log_density(self.origin + self.unit * u)
+        replay = self.replay.after(step, u, values, share, jax.vmap(density)(u))
+        shares = replay.weights(jax.vmap(jax.vmap(density))(replay.u))
+        goals = ((replay.values - seen_level) / _positive(seen_spread)).astype(rho.dtype)
 
         def loss(weights: PyTree) -> Array:
-            return surrogate_loss(eqx.combine(weights, rest), u, goal, share, up_to_constant)
+            surrogate = eqx.combine(weights, rest)
+            left = lambda u, goal, share: surrogate_loss(
+                surrogate, u, goal, share, settings.up_to_constant
+            )
+            return jnp.sum(jax.vmap(left)(replay.u, goals, shares))
 
         def update(carry, _):
             weights, opt_state = carry
@@ -78,8 +119,8 @@ class Fit(eqx.Module):
                 return (optax.apply_updates(weights, updates), opt_state), None
 
         carry = self.weights, self.opt_state
-        (weights, opt_state), _ = jax.lax.scan(update, carry, length=num_updates)
-        return Fit(weights, opt_state, self.origin, self.unit, level, spread, first_spread)
+        (weights, opt_state), _ = jax.lax.scan(update, carry, length=settings.surrogate_steps)
+        return Fit(weights, opt_state, replay, self.origin, self.unit, level, spread, first_spread)
 
 
 def surrogate_loss(
@@ -93,10 +134,11 @@ def surrogate_loss(
 
     Its expectation is the loss of eq. 2 but for a number that does not depend on h, so its gradient
     in the weights of h is unbiased. Up to a constant, the mean of what is left goes first.
+    The shares of a batch sum to one, or to less where there are others.
     """
     left = jax.vmap(surrogate)(u) - values
     if up_to_constant:
-        left -= jnp.sum(share * left)
+        left -= jnp.sum(share * left) / _positive(jnp.sum(share))
     return jnp.sum(share * left**2)
 
 

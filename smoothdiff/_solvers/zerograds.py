@@ -6,36 +6,31 @@ from typing import Any, Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from smoothdiff._batch import Batch, evaluate
-from smoothdiff._estimate import combine
-from smoothdiff._named_baselines import as_baseline
-from smoothdiff._params import Params, is_concrete, take_apart
+from smoothdiff._params import Params, take_apart
 from smoothdiff._samplers import AbstractSampler, Gaussian
 from smoothdiff._solvers._base import (
     AbstractSmoothSolver,
     Progress,
     all_finite,
     judge,
-    project,
     promotion,
     read_options,
     sigma_at,
     stopped,
     unless_failed,
 )
-from smoothdiff._solvers._surrogate_fit import Fit
-from smoothdiff._stderr import value_stderr
+from smoothdiff._solvers._descent import descended, in_units
+from smoothdiff._solvers._locality import Locality, inner_width, log, share
+from smoothdiff._solvers._replay import Replay
+from smoothdiff._solvers._surrogate_fit import Fit, Settings
 from smoothdiff.surrogates import MLP
 
-# the width of the smoothing kernel, in units of that of the locality
-_INNER = 0.15
 # the default rate of the parameters, in units of sigma
-_RATE = 0.02
+_RATE = 0.05
 # so many small updates in a row count as convergence, as in FirstOrder
 _PATIENCE = 5
 # what the surrogate's key is made with: the number of no step
@@ -66,7 +61,7 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
     so a run does not depend on the scale of the function. The point returned is the better of the
     last iterate and the one of lowest estimate, by a fresh batch each.
 
-    The defaults are the paper's but for `up_to_constant`, the rate of the parameters, the units,
+    The defaults are the paper's but for `replay` and what goes with it, the rate, the units,
     and the network and `num_samples` in many dimensions. Its ablations are `inner_sigma=0`
     (NoSmooth), `surrogate=smoothdiff.surrogates.Quadratic` (NoNN) and `local=False` (NoLocal).
 
@@ -82,15 +77,20 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
             be zero.
         num_samples: evaluations a step. The paper has 16 or 20 where there are many parameters;
             many rough steps beat few good ones.
-        surrogate_steps: updates of the surrogate for each batch.
+        surrogate_steps: updates of the surrogate for each batch: by default 10 for up to 50
+            parameters, 3 beyond, as in the paper.
+        replay: earlier batches that the fit sees again, each sample by the density of the present
+            neighbourhood there over that which drew it, at most one: by default 100 for up to 50
+            parameters, none beyond, as in the paper.
         parameter_steps: updates of the parameters for each batch.
         surrogate_optimizer: an optax transformation for the surrogate's weights.
         optimizer: an optax transformation for the parameters. It may ask for `value`, `grad` and
             `value_fn`, those of the surrogate in units of the first batch's mean deviation, so line
-            searches cost no evaluation. By default Adam with a rate of 2 % of sigma. Most of the
+            searches cost no evaluation. By default Adam with a rate of 5 % of sigma. Most of the
             paper's are 0.3 % to 0.5 %: slower, and closer in the end.
         up_to_constant: fit only how the values of a batch differ from one another, which is all
-            that a gradient needs; the paper fits the values themselves.
+            that a gradient needs. By default for more than 50 parameters; for fewer, and in the
+            paper, it is the values themselves, which replayed batches need to tell of curvature.
         local: with False the surrogate is fitted to all that is within the bounds, uniformly.
         log: fit the logarithm of the function, which must not be negative.
         sampler: where to sample; a point is $(\rho, \tau)$ as one.
@@ -124,11 +124,12 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
     surrogate: Callable[..., Any]
     inner_sigma: PyTree
     num_samples: int
-    surrogate_steps: int
+    surrogate_steps: int | None
+    replay: int | None
     parameter_steps: int
     surrogate_optimizer: optax.GradientTransformation
     optimizer: optax.GradientTransformation | None
-    up_to_constant: bool
+    up_to_constant: bool | None
     local: bool
     log: bool
     sampler: AbstractSampler
@@ -144,11 +145,12 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
         surrogate: Callable[..., Any] = MLP,
         inner_sigma: PyTree = None,
         num_samples: int = 2,
-        surrogate_steps: int = 3,
+        surrogate_steps: int | None = None,
+        replay: int | None = None,
         parameter_steps: int = 1,
         surrogate_optimizer: optax.GradientTransformation = optax.adam(1e-3),  # noqa: B008
         optimizer: optax.GradientTransformation | None = None,
-        up_to_constant: bool = True,
+        up_to_constant: bool | None = None,
         local: bool = True,
         log: bool = False,
         sampler: AbstractSampler = Gaussian(antithetic=True),  # noqa: B008 (a frozen module)
@@ -166,9 +168,11 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
                     f"{name} must be an optax transformation such as optax.adam(1e-3): {optim}"
                 )
         for name, steps in (("surrogate", surrogate_steps), ("parameter", parameter_steps)):
-            if steps < 1:
+            if steps is not None and steps < 1:
                 raise ValueError(f"{name}_steps must be at least 1, not {steps}")
-        if up_to_constant and num_samples == 1:
+        if replay is not None and replay < 0:
+            raise ValueError(f"replay must be 0 batches or more, not {replay}")
+        if up_to_constant is not False and num_samples == 1:
             raise ValueError(
                 "one sample has no differences: use num_samples=2, or up_to_constant=False"
             )
@@ -182,6 +186,7 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
         self.inner_sigma = inner_sigma
         self.num_samples = num_samples
         self.surrogate_steps = surrogate_steps
+        self.replay = replay
         self.parameter_steps = parameter_steps
         self.surrogate_optimizer = surrogate_optimizer
         self.optimizer = optimizer
@@ -208,12 +213,6 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
             raise ValueError("ZeroGrads needs a sigma for every leaf: it has no other derivatives")
         return params
 
-    def _inner(self, params: Params, y: PyTree, step: Int[Array, ""]) -> Float[Array, " n"]:
-        """The width of the smoothing kernel."""
-        if self.inner_sigma is None:
-            return _INNER * params.sigma
-        return params.layout.vector(_per_leaf(sigma_at(self.inner_sigma, step), y))
-
     def _make(self, params: Params, options: dict[str, Any]) -> tuple[PyTree, PyTree]:
         """The surrogate before any fit: its weights, and the rest of it."""
         surrogate = self.surrogate
@@ -223,80 +222,78 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
         weights, rest = eqx.partition(surrogate, eqx.is_inexact_array)
         return jax.tree.map(lambda w: w.astype(params.theta.dtype), weights), rest
 
-    def _evaluated(self, fn, args, params: Params, size: int, place, step, options) -> Batch:
-        """One batch of the function at `place(z)`, of normal z of this size."""
-
-        def fun(z: Array, _: list) -> tuple[Array, PyTree]:
-            return fn(params.layout.tree(params.clip(place(z))), args)
-
-        batch = evaluate(
-            fun,
-            take_apart(jnp.zeros(size, params.theta.dtype), 1.0, None),
-            jax.random.fold_in(read_options(options)[0], step),
-            num_samples=self.num_samples,
-            sampler=self.sampler,
-            baseline=as_baseline("none"),
-            batch_size=None,
-            nonfinite=self.nonfinite,
+    def _locality(self, params: Params, y: PyTree, step, options) -> Locality:
+        inner = inner_width(params, y, sigma_at(self.inner_sigma, step))
+        key = jax.random.fold_in(read_options(options)[0], step)
+        return Locality(
+            params, inner, key, self.sampler, self.num_samples, self.nonfinite, self.local
         )
-        if batch.log_ratio is not None:
-            raise ValueError(f"{self.sampler} has weights: ZeroGrads needs points that are normal")
-        return batch
-
-    def _sampled(self, fn, y, args, params: Params, step, options) -> tuple[Array, Batch]:
-        """Points rho around the parameters, with the function at rho - tau."""
-        inner = self._inner(params, y, step)
-
-        def place(z: Array) -> tuple[Array, Array]:
-            outer, tau = jnp.split(z, 2)
-            if self.local:
-                rho = params.theta + params.sigma * outer
-            else:
-                rho = _within(params, jax.scipy.special.ndtr(outer))
-            return rho, rho - inner * tau
-
-        size, at = 2 * params.theta.size, lambda z: place(z)[1]
-        batch = self._evaluated(fn, args, params, size, at, step, options)
-        return batch.draws.map(lambda z, _: jax.vmap(lambda z: place(z)[0])(z)), batch
-
-    def _mean(self, batch: Batch) -> tuple[Array, Array]:
-        """The mean of a batch and its standard error, which one pair alone does not have."""
-        value = combine(batch, jnp.zeros(batch.draws.n, batch.draws.dtype))
-        if batch.draws.num > self.sampler.group(batch.draws.num, batch.draws.n):
-            return value, value_stderr(batch, value)
-        return value, jnp.full_like(value, jnp.nan)
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> ZeroGradsState:
         """Makes the surrogate and checks what can be looked at; evaluates nothing."""
         step = jnp.asarray(0, jnp.int32)
         params = self._params(y, step, options)
-        self._inner(params, y, step)
+        self._locality(params, y, step, options)
         weights, _ = self._make(params, options)
         fitting = self.surrogate_optimizer.init(weights)
-        fit = Fit.start(weights, fitting, params.theta, params.sigma, f_struct.dtype)
-        opt_state = self._descent().init(y)
+        batches = 1 + self._fitting(params).replay
+        replay = Replay.start(batches, self.num_samples, params.theta, f_struct.dtype)
+        fit = Fit.start(weights, fitting, replay, params.theta, params.sigma, f_struct.dtype)
+        opt_state = self._descent(params).init(y)
         return ZeroGradsState(Progress.start(y, f_struct.dtype), fit, opt_state, step)
 
-    def _descent(self) -> optax.GradientTransformationExtraArgs:
-        return optax.with_extra_args_support(self.optimizer or optax.adam(_RATE))
+    def _fitting(self, params: Params) -> Settings:
+        return Settings.default(
+            params.theta.size,
+            surrogate_steps=self.surrogate_steps,
+            replay=self.replay,
+            up_to_constant=self.up_to_constant,
+        )
+
+    def _descent(self, params: Params) -> optax.GradientTransformationExtraArgs:
+        if self.optimizer is not None:
+            return optax.with_extra_args_support(self.optimizer)
+        return in_units(optax.adam(_RATE), params.layout, params.sigma)
+
+    def learnt(self, state: ZeroGradsState, y: PyTree[Array]) -> Callable[[PyTree], Array]:
+        """The surrogate of a run, as a function of parameters like `y`, in units of the values.
+
+        For `control_variate`, say. The state is that of `optimistix.minimise(...).state`. It stands
+        in for the function within sigma of the last iterates only, and with `up_to_constant` but
+        for a constant; with `log` it is like the logarithm.
+        """
+        options = {"key": jax.random.key(0)}  # of weights that the learnt ones replace
+        params = self._params(y, state.progress.step, options)
+        _, rest = self._make(params, options)
+        surrogate, fit = eqx.combine(state.fit.weights, rest), state.fit
+        return lambda y: fit.value(surrogate, params.layout.vector(jax.tree.leaves(y)))
 
     def step(self, fn, y, args, options, state, tags):
         """One batch, updates of the surrogate on it, and of the parameters on the surrogate."""
         progress = state.progress
         params = self._params(y, progress.step, options)
-        rho, batch = self._sampled(fn, y, args, params, progress.step, options)
+        locality = self._locality(params, y, progress.step, options)
+        rho, batch = locality.around(lambda y: fn(y, args))
         _, rest = self._make(params, options)
         fit = state.fit.updated(
             rest,
             rho,
-            _log(batch.values) if self.log else batch.values,
-            _share(batch),
+            log(batch.values) if self.log else batch.values,
+            share(batch),
             progress.step,
-            num_updates=self.surrogate_steps,
+            log_density=locality.log_density,
+            settings=self._fitting(params),
             optimizer=self.surrogate_optimizer,
-            up_to_constant=self.up_to_constant,
         )
-        new_y, opt_state = self._descended(fit, rest, params, y, state.opt_state, options)
+        surrogate, vector = eqx.combine(fit.weights, rest), params.layout.vector
+        new_y, opt_state = descended(
+            lambda y: fit.height(surrogate, vector(jax.tree.leaves(y))),
+            y,
+            state.opt_state,
+            self._descent(params),
+            read_options(options)[1],
+            length=self.parameter_steps,
+        )
         with promotion():
             moved, length = self.norm(jax.tree.map(jnp.subtract, new_y, y)), self.norm(y)
             quiet = jnp.where(moved < self.atol + self.rtol * length, state.quiet + 1, 0)
@@ -304,32 +301,12 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
         new_y, fit, opt_state = unless_failed(
             finite, (new_y, fit, opt_state), (y, state.fit, state.opt_state)
         )
-        fun, stderr = self._mean(batch)
+        fun, stderr = locality.mean(batch)
         sigma = sigma_at(self.sigma, progress.step)
         progress = progress.after(y, fun, stderr, sigma, self.num_samples, finite)
         # the function was never evaluated at y itself, so its aux is that of a sample near y
         aux = jax.tree.map(lambda a: a[0], batch.aux)
         return new_y, ZeroGradsState(progress, fit, opt_state, quiet), aux
-
-    def _descended(self, fit: Fit, rest: PyTree, params: Params, y, opt_state, options):
-        """Some updates of the parameters by the gradient of the surrogate."""
-        surrogate, optim = eqx.combine(fit.weights, rest), self._descent()
-        bounds = read_options(options)[1]
-        vector = lambda tree: params.layout.vector(jax.tree.leaves(tree))
-        height = lambda y: fit.height(surrogate, vector(y))
-
-        def update(carry, _):
-            y, opt_state = carry
-            value, grad = jax.value_and_grad(height)(y)
-            with promotion():
-                updates, opt_state = optim.update(
-                    grad, opt_state, y, value=value, grad=grad, value_fn=height
-                )
-                if self.optimizer is None:
-                    updates = params.layout.tree(vector(updates) * params.sigma)
-                return (project(optax.apply_updates(y, updates), bounds), opt_state), None
-
-        return jax.lax.scan(update, (y, opt_state), length=self.parameter_steps)[0]
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """After small updates in a row, or a failed step."""
@@ -341,46 +318,9 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
 
         def estimate(y):
             params = self._params(y, progress.step, options)
-            inner = self._inner(params, y, progress.step)
-            place, size = (lambda z: params.theta - inner * z), params.theta.size
-            return self._mean(
-                self._evaluated(fn, args, params, size, place, progress.step, options)
-            )
+            locality = self._locality(params, y, progress.step, options)
+            return locality.mean(locality.smoothed(lambda y: fn(y, args)))
 
         y, fun, stderr = judge(estimate, y, progress.best_y)
         evaluations = progress.evaluations + self.final_evaluations(y)
         return y, aux, {"fun": fun, "stderr": stderr, "evaluations": evaluations}
-
-
-def _share(batch: Batch) -> Array:
-    """The weight of each sample in a mean over those that count."""
-    valid = 1 if batch.valid is None else batch.valid.astype(batch.scale.dtype)
-    return jnp.full(batch.draws.num, batch.scale) * valid
-
-
-def _log(values: Array) -> Array:
-    """The logarithm, finite at zero; NaN below."""
-    floor = jnp.finfo(values.dtype).tiny
-    return jnp.where(values < 0, jnp.nan, jnp.log(jnp.maximum(values, floor)))
-
-
-def _within(params: Params, share: Array) -> Array:
-    """The point at these shares of the way from the lower to the upper bounds."""
-    if params.low is None or params.high is None:
-        raise ValueError("local=False samples all that is within the bounds: give bounds")
-    return params.low + (params.high - params.low) * share
-
-
-def _per_leaf(width: PyTree, y: PyTree) -> list:
-    """One inner width for each leaf; zero is allowed, unlike for the locality."""
-    try:
-        widths = jax.tree.leaves(jax.tree.broadcast(width, y))
-    except ValueError as error:
-        raise ValueError(
-            "inner_sigma must be a number or a pytree with the structure of the parameters, "
-            f"{jax.tree.structure(y)}, not {jax.tree.structure(width)}"
-        ) from error
-    for w in filter(is_concrete, widths):
-        if not np.all((np.asarray(w) >= 0) & np.isfinite(w)):
-            raise ValueError(f"inner_sigma = {w} must be finite, and positive or zero")
-    return widths

@@ -1,0 +1,46 @@
+"""Updates of the parameters on a function that costs nothing: the surrogate of ZeroGrads."""
+
+from collections.abc import Callable
+
+import jax
+import optax
+from jaxtyping import Array, Float, PyTree
+
+from smoothdiff._params import Layout
+from smoothdiff._solvers._base import project, promotion
+
+
+def descended(
+    height: Callable[[PyTree], Float[Array, ""]],
+    y: PyTree[Array],
+    opt_state: PyTree,
+    optim: optax.GradientTransformationExtraArgs,
+    bounds: tuple[PyTree, PyTree] | None,
+    *,
+    length: int,
+) -> tuple[PyTree[Array], PyTree]:
+    """Some updates by the gradient of `height`, each projected to the bounds."""
+
+    def update(carry, _):
+        y, opt_state = carry
+        value, grad = jax.value_and_grad(height)(y)
+        with promotion():
+            updates, opt_state = optim.update(
+                grad, opt_state, y, value=value, grad=grad, value_fn=height
+            )
+            return (project(optax.apply_updates(y, updates), bounds), opt_state), None
+
+    return jax.lax.scan(update, (y, opt_state), length=length)[0]
+
+
+def in_units(
+    optim: optax.GradientTransformation, layout: Layout, sigma: Float[Array, " n"]
+) -> optax.GradientTransformationExtraArgs:
+    """The transformation with its updates in units of each parameter's sigma."""
+    optim = optax.with_extra_args_support(optim)
+
+    def update(updates, state, params=None, **extra_args):
+        updates, state = optim.update(updates, state, params, **extra_args)
+        return layout.tree(sigma * layout.vector(jax.tree.leaves(updates))), state
+
+    return optax.GradientTransformationExtraArgs(optim.init, update)
