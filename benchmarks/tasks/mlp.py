@@ -40,8 +40,11 @@ def build(full: bool) -> Task:
     reference, layers = ravel_pytree(drawing)
     target = jnp.asarray(target, jnp.float32)
 
+    def residuals(y: Float[Array, "35152"]) -> Float[Array, "784"]:
+        return draw(layers(y)) - target
+
     def loss(y: Float[Array, "35152"]) -> Float[Array, ""]:
-        return jnp.mean((draw(layers(y)) - target) ** 2)
+        return jnp.mean(residuals(y) ** 2)
 
     def image(y: Float[Array, "35152"]) -> Float[Array, "28 28 3"]:
         grey = draw(layers(y)).reshape(digits.PIXELS, digits.PIXELS, 1)
@@ -59,5 +62,6 @@ def build(full: bool) -> Task:
         budget=Budget(100_000, 1200) if full else Budget(4000, 120),
         seeds=10 if full else 1,
         image=image,
+        residuals=residuals,
         notes="Many networks draw the digit: the parameter error says nothing.",
     )

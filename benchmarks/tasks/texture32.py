@@ -27,6 +27,8 @@ METHODS = (
     "zerograds",
     "cma_es_diagonal",
     "local_gradient",
+    "local_cross_entropy",
+    "gauss_newton",
 )
 SIDE = 32  # texels
 TILT = 30.0  # degrees, of the poster [-1, 1]², whose lower edge is the nearer one

@@ -20,6 +20,8 @@ from jaxtyping import Array, Bool, Float
 _REACH = 3.0
 # how many ridges the marginal likelihood chooses among
 _RIDGES = 8
+# regressions that hold the parameters at their bounds, at most
+_TIMES = 2
 # the weight of what no parameters can explain, over the smallest sum of squares seen
 _MISFIT = 0.01
 # ... and so much is enough: by then the metric is all but the identity
@@ -55,13 +57,20 @@ def gauss_newton_step(
         return _regress(gram, u, weight)
     slope = _gradient(gram, u, weight)
     active = ((low >= 0) & (slope > 0)) | ((high <= 0) & (slope < 0))
-    held = stderr = jnp.zeros_like(low)
-    for _ in range(2):
+
+    def regress(carry: tuple) -> tuple:
+        held, _, active, _, times = carry
         moved = _move(gram, u, weight, held, active)
         step, stderr = _regress(moved, jnp.where(active[None], 0, u), weight)
         step = jnp.where(active, held, step)
         held = jnp.clip(step, low, high)
-        active = active | (held != step)
+        crossed = held != step
+        return held, stderr, active | crossed, jnp.any(crossed), times + 1
+
+    # once more only where the step would cross a bound
+    none = jnp.zeros_like(low)
+    again = lambda carry: carry[3] & (carry[4] < _TIMES)
+    held, stderr, *_ = jax.lax.while_loop(again, regress, (none, none, active, True, 0))
     return held, stderr
 
 

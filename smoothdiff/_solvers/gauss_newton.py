@@ -32,6 +32,8 @@ _LONGEST = 2.0
 _SHRINK, _GROW = 0.25, 1.5
 # ... and no wider than so many times what the user gave, unless all samples are the same
 _WIDEST = 2.0
+# evaluations a step of a problem with many parameters: a step is within the span of its samples
+_MOST = 256
 # so many small steps in a row count as convergence
 _PATIENCE = 3
 
@@ -75,9 +77,9 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             error of the step asks for, and grows where all samples are the same. An optax
             schedule, a function from the number of the step to a number, is taken as it is.
         num_samples: evaluations a step, the one at the iterate included. By default
-            4 + 3 log(n) for n parameters.
-        history: evaluations to keep, whose residuals are in memory. By default 12 n, but at
-            least 64 and at most 256.
+            4 + 3 log(n) for n parameters, for more than about 24 of them n / 2, at most 256.
+        history: evaluations to keep, whose points and residuals are in memory. By default 12 n,
+            but at least 64 and at most 256, and never less than three steps.
         sampler: where to sample.
         batch_size: evaluate at most so many samples at a time, as for `smooth`.
         nonfinite: "propagate" or "drop" samples with a NaN or an infinity in their residuals; as
@@ -150,7 +152,9 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     def evaluations_per_step(self, y: PyTree[Array]) -> int:
         """One batch."""
         n = sum(leaf.size for leaf in jax.tree.leaves(y))
-        return int(4 + 3 * math.log(n)) if self.num_samples is None else self.num_samples
+        if self.num_samples is not None:
+            return self.num_samples
+        return max(int(4 + 3 * math.log(n)), min(n // 2, _MOST))
 
     def final_evaluations(self, y: PyTree[Array]) -> int:
         """A batch for each of the two candidates."""
@@ -191,8 +195,10 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
                 )
         n, dtype = params.theta.size, params.theta.dtype
         samples = self.evaluations_per_step(y)
-        history = min(max(12 * n, 64), 256) if self.history is None else self.history
-        history = max(history, samples)
+        if self.history is None:
+            history = max(min(max(12 * n, 64), 256), 3 * samples)
+        else:
+            history = max(self.history, samples)
         size = sum(leaf.size for leaf in leaves)
         return GaussNewtonState(
             Progress.start(y, dtype),
