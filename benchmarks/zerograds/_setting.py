@@ -35,7 +35,6 @@ QUICK = Setting(
     name="quick",
     seeds=2,
     budgets={
-        "mosaic": 2000,
         "brdf": 1000,
         "led": 4000,
         "wicker": 600,
