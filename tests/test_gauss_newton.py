@@ -138,6 +138,30 @@ def test_many_parameters_need_no_square_matrix_of_them():
     assert result.fun < 0.5 * result.history[0].fun
 
 
+@pytest.mark.parametrize("parameters", [3, 40])
+def test_an_unknown_linear_map_is_learnt(parameters):
+    """Fewer or more parameters than evaluations in the history, and a side that is closed."""
+    matrix = np.random.default_rng(2).normal(size=(parameters, parameters)) / parameters**0.5
+    sought = np.linspace(0.1, 0.9, parameters)
+    result = sd.least_squares(
+        lambda y, args: jnp.asarray(matrix, y.dtype) @ (y - jnp.asarray(sought, y.dtype)),
+        jnp.full(parameters, 0.5),
+        key=KEY,
+        solver=sd.GaussNewton(0.5, num_samples=12, history=36),
+        max_evaluations=60 * parameters,
+        bounds=(0.0, None),
+    )
+    start = np.sum((matrix @ (0.5 - sought)) ** 2) / 2
+    assert result.fun < 0.02 * start
+
+
+def test_defaults_grow_with_the_parameters():
+    few, many, very_many = (
+        sd.GaussNewton(1.0).evaluations_per_step(jnp.zeros(n)) for n in (2, 100, 10**5)
+    )
+    assert (few, many, very_many) == (6, 50, 256)
+
+
 def test_a_schedule_is_taken_as_it_is():
     schedule = lambda step: 0.5 / (step + 1)
     solver = sd.GaussNewton(schedule)

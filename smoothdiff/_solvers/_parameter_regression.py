@@ -133,8 +133,16 @@ def _eye(like: Array) -> Array:
 
 def _svd(u: Array) -> tuple[Array, Array, Array]:
     """The singular value decomposition without its null space: zeros there, 1 / s in the middle."""
-    left, s, right = jnp.linalg.svd(u, full_matrices=False)
-    kept = s > len(u) * jnp.finfo(u.dtype).eps * s[0]
+    eps = len(u) * jnp.finfo(u.dtype).eps
+    if u.shape[0] >= u.shape[1]:
+        left, s, right = jnp.linalg.svd(u, full_matrices=False)
+        kept = s > eps * s[0]
+    else:
+        # of many parameters by the Gram matrix: several times as fast, at half of the digits
+        squares, left = jnp.linalg.eigh(_dot(u, u.T))
+        kept = squares > eps * squares[-1]
+        s = jnp.sqrt(jnp.where(kept, squares, 1))
+        right = _dot(left.T, u) / s[:, None]
     left = jnp.where(kept[None], left, 0)
     return left, jnp.where(kept, 1 / jnp.where(kept, s, 1), 0), right
 
