@@ -237,7 +237,7 @@ def test_the_toy_is_smoothed_and_solved():
         values = toy.loss(np.clip(at + 0.1 * draws, 0, 1))
         assert abs(values.mean() - smooth) < 4 * values.std() / len(draws) ** 0.5 + 1e-3
     frames = toy.measure(TINY, None, False)["frames"]  # type: ignore[arg-type]
-    assert [frame["evaluations"] for frame in frames] == [0, 40, 140, 400]
+    assert [frame["evaluations"] for frame in frames] == [0, 80, 280, 800]
     assert frames[-1]["loss"] == 0
     assert frames[1]["surrogate"][0] > frames[1]["surrogate"][-1]  # it leads towards the reference
 

@@ -20,7 +20,7 @@ from benchmarks.zerograds._setting import PLENTY, Setting
 from smoothdiff.surrogates import MLP
 
 SHOWN = (0.0, 0.1, 0.35, 1.0)  # of the iterations, as in the paper
-BUDGET, START, REFERENCE, SIGMA = 400, 0.18, 0.75, 0.1
+BUDGET, START, REFERENCE, SIGMA = 800, 0.18, 0.75, 0.1
 LAST = 40  # samples that are drawn
 NODES = ndtri((np.arange(1000) + 0.5) / 1000)  # of the quadrature that smooths
 GRID = np.linspace(0, 1, 401)
