@@ -162,6 +162,7 @@ def draw(results: dict[str, Any], folder: Path) -> None:
             axis.set_ylim(FLOOR / 1.3, 3)
         for axis in axes[:, 0]:
             axis.set_ylabel("Image error")
-        drawn.supxlabel("Evaluations", fontsize=9)
+        for axis in axes[-1]:
+            axis.set_xlabel("Evaluations")
         handles = [axes[0, 0].plot([], [], **look[name])[0] for name in titles]
         legend(drawn, handles, list(titles.values()))
