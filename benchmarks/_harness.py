@@ -251,16 +251,11 @@ def _solve(task: Task, solve: Solve, seed: int, counter: Counter, exact_loss: Lo
 
 
 def _distances(task: Task, unravel: Callable, ys: Sequence[np.ndarray], sought) -> np.ndarray:
-    """How far each point is from the y that is sought, or how many entries are wrong."""
-    if task.distance is not None:
-        distance = jax.jit(task.distance)
-        return np.array([float(distance(unravel(y))) for y in ys])
-    if task.discrete is None:
+    """How far each point is from the y that is sought, in the task's own sense if it has one."""
+    if task.distance is None:
         return np.linalg.norm(np.asarray(ys, float) - sought.astype(float), axis=1)
-    read = jax.jit(task.discrete)
-    meaning = lambda y: np.asarray(read(unravel(y)))
-    wrong = [np.sum(meaning(y) != meaning(sought)) for y in ys]
-    return np.asarray(wrong, float)
+    distance = jax.jit(task.distance)
+    return np.array([float(distance(unravel(y))) for y in ys])
 
 
 def _flat(y: Y) -> np.ndarray:
@@ -275,8 +270,8 @@ def _behaviour(task: Task) -> str:
     losses = [float(task.loss(y)) for y in points]
     bounds = [_flat(y).tolist() for y in (*points, *task.bounds)]
     said = (task.name, task.budget, task.sigma, task.notes, losses, bounds)
-    if task.discrete is not None:
-        said += ([np.asarray(task.discrete(y)).tolist() for y in points],)
+    if task.distance is not None:
+        said += ([float(task.distance(y)) for y in points],)
     return repr(said)
 
 

@@ -81,10 +81,8 @@ class Task:
         support: Which of the terms a parameter may influence, as for `smoothdiff.smooth`.
         grey: The loss in two parts, for methods that use AD where they can; or None. With it, the
             loss is that of these parts, and costs an evaluation for each case.
-        distance: How far y is from what is sought, y -> number, for a y that is one of many, such
-            as the weights of a network; or None. It is the parameter error then.
-        discrete: What y means to a program of switches and counts, y -> array, or None. The
-            parameter error is then the number of its entries that differ from the reference's.
+        distance: How far y is from what is sought, y -> number, where that is not the length of
+            their difference: wrong switches, or the poses that a network says. Or None.
         precision: What the task is run in; all of its functions are called in it.
         optimum: The lowest value of the loss, or None. With it, runs are also scored by how far
             above it they are.
@@ -110,7 +108,6 @@ class Task:
     support: Callable[[Y], Any] | None = None
     grey: Grey | None = None
     distance: Callable[[Y], jax.Array] | None = None
-    discrete: Callable[[Y], jax.Array] | None = None
     precision: Literal["float32", "float64"] = "float32"
     optimum: float | None = None
     choose: Callable[[int], Y] | None = None

@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int, Shaped
 
 from benchmarks._task import Task
 
@@ -17,6 +17,7 @@ def drawn(
     draw: Callable[[Float[Array, " n"]], Float[Array, "..."]],
     reference: np.ndarray,
     support: Any = None,
+    meaning: Callable[[Float[Array, " n"]], Shaped[Array, "..."]] | None = None,
     **others: Any,
 ) -> Task:
     """The task of finding what draws the same as the reference does.
@@ -30,6 +31,8 @@ def drawn(
         draw: From parameters to an array: a picture, or places at some times.
         reference: The parameters that are sought, each in [0, 1].
         support: Which parts of what is drawn a parameter may influence, or None.
+        meaning: What parameters mean to a program of switches and counts, or None. The parameter
+            error is then the number of entries that differ from the reference's.
         others: Further fields of the task.
     """
     sought = jnp.asarray(reference, jnp.float32)
@@ -44,6 +47,10 @@ def drawn(
     def terms(y: Float[Array, " n"]) -> Float[Array, "..."]:
         return residuals(y) ** 2 / target.size
 
+    def wrong(y: Float[Array, " n"]) -> Int[Array, ""]:
+        assert meaning is not None
+        return jnp.sum(meaning(y) != meaning(sought))
+
     return Task(
         name=name,
         title=title,
@@ -55,5 +62,6 @@ def drawn(
         residuals=residuals,
         terms=None if support is None else terms,
         support=support,
+        distance=None if meaning is None else wrong,
         **others,
     )

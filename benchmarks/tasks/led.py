@@ -71,7 +71,7 @@ def build(full: bool) -> Task:
         budget=Budget(60_000, 600) if full else Budget(8000, 120),
         seeds=10 if full else 3,
         image=lambda y: jnp.stack([draw(y), 0.1 * draw(y), 0.1 * draw(y)], axis=-1),
-        discrete=switches,
+        meaning=switches,
         optimum=0.0,
         notes="Both errors are the wrong switches, relative to those of the start.",
     )

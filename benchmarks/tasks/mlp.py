@@ -7,11 +7,10 @@ ZeroGrads (supplement, Table 1). The reference is one of many networks that draw
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from benchmarks import methods
-from benchmarks._task import Budget, Task
+from benchmarks._task import Task
 from benchmarks.scenes import digits, networks
 
 TITLE = "MLP: 35,152 weights of a network that draws a digit"
@@ -20,7 +19,6 @@ LAYERS = (256, 32, 32, 784)
 DIGIT = 3
 CONTRAST = 0.96  # of the digit: a sigmoid reaches neither 0 nor 1
 INPUT = np.random.default_rng(0).uniform(-1, 1, LAYERS[0])
-BOUND = 5.0
 SIGMA = 0.025
 
 
@@ -37,31 +35,19 @@ def build(full: bool) -> Task:
     # all is in the last bias
     drawing = jax.tree.map(jnp.zeros_like, networks.initial(LAYERS, jax.random.key(0)))
     drawing[-1] = drawing[-1][0], jnp.asarray(np.log(target / (1 - target)), jnp.float32)
-    reference, layers = ravel_pytree(drawing)
-    target = jnp.asarray(target, jnp.float32)
 
-    def residuals(y: Float[Array, "35152"]) -> Float[Array, "784"]:
-        return draw(layers(y)) - target
-
-    def loss(y: Float[Array, "35152"]) -> Float[Array, ""]:
-        return jnp.mean(residuals(y) ** 2)
-
-    def image(y: Float[Array, "35152"]) -> Float[Array, "28 28 3"]:
-        grey = draw(layers(y)).reshape(digits.PIXELS, digits.PIXELS, 1)
+    def image(layers: networks.Layers) -> Float[Array, "28 28 3"]:
+        grey = draw(layers).reshape(digits.PIXELS, digits.PIXELS, 1)
         return jnp.repeat(grey, 3, axis=-1)
 
-    return Task(
-        name="mlp",
-        title=TITLE,
-        loss=loss,
-        exact_loss=loss,
-        start=lambda seed: ravel_pytree(networks.initial(LAYERS, jax.random.key(seed)))[0],
-        reference=reference,
-        bounds=(jnp.full_like(reference, -BOUND), jnp.full_like(reference, BOUND)),
-        sigma=SIGMA,
-        budget=Budget(100_000, 1200) if full else Budget(4000, 120),
-        seeds=10 if full else 1,
-        image=image,
-        residuals=residuals,
-        notes="Many networks draw the digit: the parameter error says nothing.",
+    return networks.weights_task(
+        full,
+        "mlp",
+        TITLE,
+        draw,
+        jnp.asarray(target, jnp.float32),
+        drawing,
+        image,
+        SIGMA,
+        "Many networks draw the digit: the parameter error says nothing.",
     )

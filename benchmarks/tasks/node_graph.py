@@ -84,7 +84,7 @@ def build(full: bool) -> Task:
         budget=Budget(10_000, 240) if full else Budget(2000, 60),
         seeds=10 if full else 3,
         image=draw,
-        discrete=edges,
+        meaning=edges,
         optimum=0.0,
         notes=f"{PIXELS} x {PIXELS} pixels; an edge may have no effect",
     )

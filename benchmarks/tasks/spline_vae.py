@@ -13,12 +13,11 @@ known decoder draws, so the lowest loss is 0. Sigma is that of ZeroGrads (supple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 from scipy import interpolate
 
 from benchmarks import methods
-from benchmarks._task import Budget, Task
+from benchmarks._task import Task
 from benchmarks.scenes import digits, networks
 
 TITLE = "Spline VAE: 8,764 weights of a decoder that draws digits"
@@ -26,7 +25,6 @@ METHODS = methods.MANY_PARAMETERS
 LAYERS = (20, 34, 146, 20)
 POINTS, SAMPLES = 10, 120  # of a spline: what it goes through, and what is drawn
 PEN = 2  # its width, in pixels
-BOUND = 2.0
 SIGMA = 0.025
 _TIMES = np.linspace(0, POINTS - 1, SAMPLES)
 SPLINE = interpolate.CubicSpline(np.arange(POINTS), np.eye(POINTS))(_TIMES)
@@ -77,42 +75,31 @@ def solved(codes: Float[Array, "10 20"]) -> networks.Layers:
     """A decoder that draws the digits: one before training, but for its last layer."""
     layers = networks.initial(LAYERS, jax.random.key(2**31))
     features = jax.vmap(lambda code: networks.hidden(layers, code))(codes)
-    with_ones = np.pad(np.asarray(features, float), ((0, 0), (0, 1)), constant_values=1)
     moves = (DIGITS - DIAGONAL).reshape(len(DIGITS), -1)
-    weights, bias = np.split(np.linalg.lstsq(with_ones, moves)[0].T, [-1], axis=1)
-    last = jnp.asarray(weights, jnp.float32), jnp.asarray(bias[:, 0], jnp.float32)
-    return [*layers[:-1], last]
+    return [*layers[:-1], networks.last_layer(features, moves)]
 
 
 def build(full: bool) -> Task:
     """Starts are decoders as they are before training."""
     code = jnp.asarray(codes(), jnp.float32)
-    reference, layers = ravel_pytree(solved(code))
+    decoder = solved(code)
 
     @jax.jit
-    def drawn(y: Float[Array, "8764"]) -> Float[Array, "10 28 28"]:
-        return jax.vmap(lambda code: draw(layers(y), code))(code)
+    def drawn(layers: networks.Layers) -> Float[Array, "10 28 28"]:
+        return jax.vmap(lambda code: draw(layers, code))(code)
 
-    target = drawn(reference)
-
-    def loss(y: Float[Array, "8764"]) -> Float[Array, ""]:
-        return jnp.mean((drawn(y) - target) ** 2)
-
-    def image(y: Float[Array, "8764"]) -> Float[Array, "56 140 3"]:
-        grey = jnp.block([list(row) for row in drawn(y).reshape(2, 5, 28, 28)])
+    def image(layers: networks.Layers) -> Float[Array, "56 140 3"]:
+        grey = jnp.block([list(row) for row in drawn(layers).reshape(2, 5, 28, 28)])
         return jnp.repeat(grey[..., None], 3, axis=-1)
 
-    return Task(
-        name="spline-vae",
-        title=TITLE,
-        loss=loss,
-        exact_loss=loss,
-        start=lambda seed: ravel_pytree(networks.initial(LAYERS, jax.random.key(seed)))[0],
-        reference=reference,
-        bounds=(jnp.full_like(reference, -BOUND), jnp.full_like(reference, BOUND)),
-        sigma=SIGMA,
-        budget=Budget(100_000, 1200) if full else Budget(4000, 120),
-        seeds=10 if full else 1,
-        image=image,
-        notes="Many decoders draw the digits: the parameter error says nothing.",
+    return networks.weights_task(
+        full,
+        "spline-vae",
+        TITLE,
+        drawn,
+        drawn(decoder),
+        decoder,
+        image,
+        SIGMA,
+        "Many decoders draw the digits: the parameter error says nothing.",
     )

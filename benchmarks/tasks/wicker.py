@@ -58,7 +58,7 @@ def build(full: bool) -> Task:
         budget=Budget(3000, 240) if full else Budget(600, 60),
         seeds=10 if full else 3,
         image=draw,
-        discrete=counts,
+        meaning=counts,
         optimum=0.0,
         notes=f"{PIXELS} x {PIXELS} pixels",
     )
