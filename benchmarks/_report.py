@@ -1,5 +1,6 @@
 """Results as pictures and as a table on the terminal."""
 
+from collections.abc import Container
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -11,7 +12,7 @@ from rich import box
 from rich.console import Group
 from rich.table import Table
 
-from benchmarks._style import figure, legend, looks
+from benchmarks._style import CROWDED, figure, legend, looks
 from benchmarks._summary import COSTS, LEVELS, band
 from benchmarks._task import Task
 
@@ -55,22 +56,39 @@ def errors_of(results: dict[str, Any]) -> list[str]:
 def _curves(results: dict[str, Any], cost: str, path: Path) -> None:
     """Median and quartiles over the starts, a panel for each error."""
     methods, look, errors = able(results), looks(results["methods"]), errors_of(results)
+    strong = {name for name, found in methods.items() if "(ours)" in found["title"]}
+    if len(methods) > CROWDED:
+        look = emphasised(look, strong)
     with figure(path, 1, len(errors), (4.5 * len(errors), 3.8)) as (drawn, axes):
         for axis, error in zip(axes[0], errors, strict=True):
-            panel(axis, methods, look, error, cost)
+            panel(axis, methods, look, error, cost, strong if len(methods) > CROWDED else methods)
         starts = max(found["starts"] for found in methods.values())
+        what = "medians, quartiles of ours," if len(methods) > CROWDED else "median and quartiles"
         handles, labels = axes[0, 0].get_legend_handles_labels()
         legend(drawn, handles, labels)
         drawn.suptitle(
-            f"{results['title']} ({results['setting']}): median and quartiles over {starts} starts",
+            f"{results['title']} ({results['setting']}): {what} over {starts} starts",
             x=0.01,
             ha="left",
             fontsize=10,
         )
 
 
-def panel(axis, methods: dict[str, Any], look: dict[str, dict], error: str, cost: str) -> None:
-    """Median and quartiles of one error over the starts, against what they cost."""
+def emphasised(look: dict[str, dict], strong: Container[str]) -> dict[str, dict]:
+    """Thick lines on top for some, thin ones for the others: among many, all are lost."""
+    kinds = {True: {"linewidth": 2.6, "zorder": 3}, False: {"linewidth": 1.1, "zorder": 2}}
+    return {name: line | kinds[name in strong] for name, line in look.items()}
+
+
+def panel(
+    axis,
+    methods: dict[str, Any],
+    look: dict[str, dict],
+    error: str,
+    cost: str,
+    banded: Container[str],
+) -> None:
+    """Median of one error over the starts, against what they cost; quartiles for those `banded`."""
     lowest, highest = 0.1, 1.0
     for name, found in methods.items():
         runs = found["runs"]
@@ -80,8 +98,9 @@ def panel(axis, methods: dict[str, Any], look: dict[str, dict], error: str, cost
         grid = np.geomspace(costs[costs > 0].min(), costs.max(), 200)
         low, middle, high = np.maximum(band(runs, error, cost, grid), FLOORS[error])
         axis.plot(grid, middle, label=found["title"], **look[name])
-        axis.fill_between(grid, low, high, color=look[name]["color"], alpha=0.15, lw=0)
-        lowest, highest = min(lowest, low.min()), max(highest, high.max())
+        if name in banded:
+            axis.fill_between(grid, low, high, color=look[name]["color"], alpha=0.15, lw=0)
+        lowest, highest = min(lowest, middle.min()), max(highest, middle.max())
     axis.set(ylim=(lowest / 1.3, highest * 1.3))
     axis.set(xscale="log", yscale="log", xlabel=LABELS[cost], title=LABELS[error])
     for level in (level for level in LEVELS[error].values() if level >= lowest):

@@ -139,8 +139,9 @@ def _curves(scene: Scene, look: _panels.Look) -> str:
     )
     starts = max(found["starts"] for found in scene.ran.values())
     return (
-        f"<figure><figcaption>Median and quartiles over {starts} starts. The thick line is ours; "
-        f"the lines are named in the tables.</figcaption><div class=panels>{shown}</div></figure>"
+        f"<figure><figcaption>Medians over {starts} starts. The thick line is ours, with its "
+        "quartiles; the lines are named in the tables.</figcaption>"
+        f"<div class=panels>{shown}</div></figure>"
     )
 
 

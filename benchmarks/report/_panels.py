@@ -4,7 +4,7 @@ import io
 
 from PIL import Image
 
-from benchmarks._report import LABELS, panel
+from benchmarks._report import LABELS, emphasised, panel
 from benchmarks._style import STYLE, looks, plt
 from benchmarks.report._atlas import png_uri
 from benchmarks.report._scene import COSTS, ERRORS, Scene, all_methods
@@ -38,17 +38,14 @@ def _swatch(color: str, linestyle) -> str:
 
 def panels(scene: Scene, look: Look) -> list[tuple[str, str]]:
     """What each picture shows, and the picture as the source of an <img>."""
-    width = lambda name: {"linewidth": 3.0 if name == scene.ours else 1.3}
-    lines = {name: look[name] | width(name) for name in scene.ran}
-    # ours is drawn last, over the others
-    order = sorted(scene.ran, key=lambda name: name == scene.ours)
-    found = {name: scene.ran[name] for name in order}
+    strong = {scene.ours}
+    lines = emphasised({name: look[name] for name in scene.ran}, strong)
     shown = []
     for error in ERRORS:
         for cost in COSTS:
             with plt.rc_context(STYLE):
                 drawn, axis = plt.subplots(figsize=SIZE)
-                panel(axis, found, lines, error, cost)
+                panel(axis, scene.ran, lines, error, cost, strong)
                 written = io.BytesIO()
                 drawn.savefig(written, format="png", dpi=DPI)
                 plt.close(drawn)

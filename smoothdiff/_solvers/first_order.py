@@ -71,6 +71,11 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
         atol: absolute tolerance. By default both are zero, and the run uses up its budget.
         norm: the norm of updates and iterates.
 
+    Raises:
+        TypeError: an `optim` that is no optax transformation.
+        ValueError: when it runs, what `smooth` refuses: a sigma, a number of samples or a baseline
+            that does not go with the parameters.
+
     Example:
         >>> import jax, jax.numpy as jnp, optax, optimistix as optx, smoothdiff as sd
         >>> plateaus = lambda y, args: jnp.sum(jnp.floor(4 * jnp.abs(y - 1)))

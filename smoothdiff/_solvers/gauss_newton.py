@@ -89,6 +89,11 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         atol: absolute tolerance. By default both are zero, and the run uses up its budget.
         norm: the norm of steps and iterates.
 
+    Raises:
+        ValueError: fewer than 3 evaluations a step, a history that holds less than a step, another
+            word for `nonfinite`; and, when it runs, a leaf without a sigma.
+        TypeError: residuals that are no real floating-point numbers.
+
     Example:
         >>> import jax, jax.numpy as jnp, optimistix as optx, smoothdiff as sd
         >>> pixels = jnp.arange(32.0)

@@ -102,9 +102,9 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
 
     Raises:
         TypeError: a surrogate that cannot be called, an optimizer that is no optax transformation.
-        ValueError: no steps, or one sample where differences are fitted; and, when it runs, a leaf
-            without a sigma, an inner sigma that is negative or of another structure, a sampler with
-            weights, `local=False` without bounds.
+        ValueError: no steps, a negative `replay`, or one sample where differences are fitted; and,
+            when it runs, a leaf without a sigma, an inner sigma that is negative or of another
+            structure, a sampler with weights, `local=False` without bounds.
 
     Example:
         >>> import jax, jax.numpy as jnp, smoothdiff as sd
@@ -258,9 +258,18 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
     def learnt(self, state: ZeroGradsState, y: PyTree[Array]) -> Callable[[PyTree], Array]:
         """The surrogate of a run, as a function of parameters like `y`, in units of the values.
 
-        For `control_variate`, say. The state is that of `optimistix.minimise(...).state`. It stands
-        in for the function within sigma of the last iterates only, and with `up_to_constant` but
-        for a constant; with `log` it is like the logarithm.
+        For `control_variate`, say. It stands in for the function within sigma of the last iterates
+        only, and with `up_to_constant` but for a constant; with `log` it is like the logarithm.
+
+        Args:
+            state: that of a run, `optimistix.minimise(...).state`.
+            y: parameters of that run; only their structure and shapes count.
+
+        Returns:
+            A differentiable function from parameters to a number.
+
+        Raises:
+            ValueError: as a run does, a leaf without a sigma.
         """
         options = {"key": jax.random.key(0)}  # of weights that the learnt ones replace
         params = self._params(y, state.progress.step, options)
