@@ -1,5 +1,6 @@
 """Gauss-Newton on residuals: known optima, bounds, plateaus, faults, optimistix's solvers."""
 
+import itertools
 from typing import Any
 
 import jax
@@ -155,11 +156,43 @@ def test_an_unknown_linear_map_is_learnt(parameters):
     assert result.fun < 0.02 * start
 
 
+@pytest.mark.parametrize("bounds", [None, (-4.0, 4.0)])
+def test_which_residuals_a_parameter_moves_is_found(bounds):
+    """Each residual has two parameters of its own; 4,200 others do nothing."""
+    n, size = 5_000, 400
+    sought = jnp.asarray(np.random.default_rng(0).normal(size=size), jnp.float32)
+    fun = lambda y, args: y[:size] + 0.3 * y[size : 2 * size] - sought
+    result = solve(fun, jnp.zeros(n), sigma=0.5, evaluations=6 * 96, bounds=bounds)
+    assert float(jnp.sum(fun(result.y, None) ** 2)) < 0.01 * float(jnp.sum(sought**2))
+
+
+def test_a_few_directions_of_many_parameters_are_enough():
+    """No residual has parameters of its own, but all depend on few combinations of them."""
+    n, rank = 5_000, 10
+    rng = np.random.default_rng(1)
+    mix = jnp.asarray(rng.normal(size=(rank, n)) / n**0.5, jnp.float32)
+    show = jnp.asarray(rng.normal(size=(60, rank)), jnp.float32)
+    fun = lambda y, args: show @ (mix @ y - 1)
+    result = solve(fun, jnp.zeros(n), sigma=1.0, evaluations=4 * 96)
+    start = float(jnp.sum(fun(jnp.zeros(n), None) ** 2))
+    assert float(jnp.sum(fun(result.y, None) ** 2)) < 1e-3 * start
+
+
+def test_steps_that_make_it_worse_are_not_taken():
+    """A narrow valley, and noise in no direction: the sum of squares never rises."""
+    n = 200
+    fun = lambda y, args: jnp.concatenate([10 * (y[1:] - y[:-1] ** 2), 1 - y[:-1]])
+    result = solve(fun, jnp.full(n, -0.5), sigma=0.1, evaluations=10 * 96)
+    squares = [float(jnp.sum(fun(record.y, None) ** 2)) for record in result.history]
+    assert all(after <= before for before, after in itertools.pairwise(squares))
+    assert squares[-1] < 0.5 * squares[0]
+
+
 def test_defaults_grow_with_the_parameters():
     few, many, very_many = (
         sd.GaussNewton(1.0).evaluations_per_step(jnp.zeros(n)) for n in (2, 100, 10**5)
     )
-    assert (few, many, very_many) == (6, 50, 256)
+    assert (few, many, very_many) == (6, 50, 96)
 
 
 def test_a_schedule_is_taken_as_it_is():

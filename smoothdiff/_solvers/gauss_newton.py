@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from smoothdiff._draws import Draws
 from smoothdiff._params import Params, take_apart
-from smoothdiff._samplers import AbstractSampler, Sobol
+from smoothdiff._samplers import AbstractSampler, Gaussian, Sobol
 from smoothdiff._solvers._base import (
     AbstractSmoothSolver,
     Progress,
@@ -24,6 +24,7 @@ from smoothdiff._solvers._base import (
     stopped,
     unless_failed,
 )
+from smoothdiff._solvers._local_steps import TRIED, steps_to_try
 from smoothdiff._solvers._parameter_regression import gauss_newton_step
 
 # the longest step of any parameter, in units of its sigma: beyond it nothing has been seen
@@ -32,8 +33,10 @@ _LONGEST = 2.0
 _SHRINK, _GROW = 0.25, 1.5
 # ... and no wider than so many times what the user gave, unless all samples are the same
 _WIDEST = 2.0
-# evaluations a step of a problem with many parameters: a step is within the span of its samples
-_MOST = 256
+# evaluations a step of a problem with many parameters
+_MOST = 96
+# from so many parameters on, several steps are evaluated and the best is taken
+_MANY = 100
 # so many small steps in a row count as convergence
 _PATIENCE = 3
 
@@ -64,6 +67,13 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     A step is not checked by evaluations of its own; the next batch includes its end point, and
     fits in what it finds.
 
+    With 100 parameters and more, where a batch says little about each of so many, 12 evaluations of
+    a step go to the ends of 12 steps, and the best is taken if it is an improvement: the one above
+    at several lengths, and steps by a Jacobian of which only those entries are kept that cannot be
+    chance. That finds by itself which residuals a parameter moves, if these are few, from a number
+    of samples that grows with the logarithm of n. It takes n x P numbers for P residuals, and is
+    left out where that is more than 2e8.
+
     What is sought is a small sum of squares, $\min_y \frac12 \sum_p r_p(y)^2$. Where it does not
     vanish the metric becomes the identity as sigma shrinks, so that the limit is the least-squares
     solution. The `fun` that is reported, and by which the result is judged, is the smoothed loss
@@ -77,10 +87,12 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             error of the step asks for, and grows where all samples are the same. An optax
             schedule, a function from the number of the step to a number, is taken as it is.
         num_samples: evaluations a step, the one at the iterate included. By default
-            4 + 3 log(n) for n parameters, for more than about 24 of them n / 2, at most 256.
+            4 + 3 log(n) for n parameters, for more than about 24 of them n / 2, at most 96.
         history: evaluations to keep, whose points and residuals are in memory. By default 12 n,
-            but at least 64 and at most 256, and never less than three steps.
-        sampler: where to sample.
+            but at least 64 and at most 256, and never less than three steps; four steps for 100
+            parameters and more.
+        sampler: where to sample. By default `Sobol`, for 100 parameters and more `Gaussian`, as
+            few Sobol points in many dimensions make parameters look alike.
         batch_size: evaluate at most so many samples at a time, as for `smooth`.
         nonfinite: "propagate" or "drop" samples with a NaN or an infinity in their residuals; as
             long as half of a batch are finite.
@@ -116,7 +128,7 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     sigma: PyTree
     num_samples: int | None
     history: int | None
-    sampler: AbstractSampler
+    sampler: AbstractSampler | None
     batch_size: int | None
     nonfinite: Literal["propagate", "drop"]
     rtol: float
@@ -129,7 +141,7 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         *,
         num_samples: int | None = None,
         history: int | None = None,
-        sampler: AbstractSampler = Sobol(),  # noqa: B008 (a frozen module)
+        sampler: AbstractSampler | None = None,
         batch_size: int | None = None,
         nonfinite: Literal["propagate", "drop"] = "propagate",
         rtol: float = 0.0,
@@ -165,6 +177,20 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         """A batch for each of the two candidates."""
         return 2 * self.evaluations_per_step(y)
 
+    def _tried(self, y: PyTree[Array]) -> int:
+        """How many steps are evaluated to find the best: none with few parameters."""
+        n = sum(leaf.size for leaf in jax.tree.leaves(y))
+        return 0 if n < _MANY or self.evaluations_per_step(y) < 3 * TRIED else TRIED
+
+    def _best(self, fn, args, params: Params, sigma, steps, here) -> tuple[Array, Array]:
+        """The step that leads to the smallest sum of squares, if that is a smaller one."""
+        ends = jax.vmap(params.clip)(params.theta[None] + sigma[None] * steps)
+        found = jnp.sum(self._evaluate(fn, args, params, ends)[0] ** 2, axis=1)
+        found = jnp.where(jnp.isfinite(found), found, jnp.inf)
+        best = jnp.argmin(found)
+        move = jnp.where(found[best] < jnp.sum(here**2), steps[best], 0)
+        return move, jnp.max(jnp.abs(move))
+
     def _params(self, y: PyTree, step: Int[Array, ""], options: dict) -> Params:
         params = take_apart(y, sigma_at(self.sigma, step), read_options(options)[1])
         if params.free:
@@ -184,7 +210,9 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     def _sample(self, params: Params, key: Array, sigma: Array, count: int) -> Array:
         """Points around the parameters, within the bounds."""
         n = params.theta.size
-        draws = Draws(self.sampler, key, count, n, params.theta.dtype, None)
+        # few Sobol points are all but the same in some pairs of very many dimensions
+        sampler = self.sampler or (Sobol() if n < _MANY else Gaussian())
+        draws = Draws(sampler, key, count, n, params.theta.dtype, None)
         return draws.map(lambda z, _: jax.vmap(params.clip)(params.theta[None] + sigma[None] * z))
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> GaussNewtonState:
@@ -199,9 +227,9 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
                     "numbers: use .astype(float)"
                 )
         n, dtype = params.theta.size, params.theta.dtype
-        samples = self.evaluations_per_step(y)
+        samples = self.evaluations_per_step(y) - self._tried(y)
         if self.history is None:
-            history = max(min(max(12 * n, 64), 256), 3 * samples)
+            history = max(min(max(12 * n, 64), 256), (3 if n < _MANY else 4) * samples)
         else:
             history = max(self.history, samples)
         size = sum(leaf.size for leaf in leaves)
@@ -221,6 +249,8 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         key = jax.random.fold_in(read_options(options)[0], progress.step)
         count = self.evaluations_per_step(y)
         sigma = params.sigma * state.scale
+        tried = self._tried(y)
+        count = count - tried
         around = self._sample(params, key, sigma, count - 1)
         new = jnp.concatenate([params.theta[None], around])
         batch, aux = self._evaluate(fn, args, params, new)
@@ -237,9 +267,14 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             None if side is None else (side - params.theta) / sigma
             for side in (params.low, params.high)
         ]
-        move, error = gauss_newton_step(u, residuals, valid, *sides)
+        # steps that are evaluated are so within the bounds
+        known = (None, None) if tried else sides
+        move, error = gauss_newton_step(u, residuals, valid, *known)
         longest = jnp.max(jnp.abs(move))
         move = move / jnp.maximum(1, longest / _LONGEST)
+        if tried:
+            steps = steps_to_try(move, u, residuals, valid, batch[0], count, *sides)
+            move, longest = self._best(fn, args, params, sigma, steps, batch[0])
         theta = params.clip(params.theta + sigma * move)
         same = jnp.all(jnp.where(good[:, None], batch == batch[jnp.argmax(good)][None], True))
         scale = state.scale
@@ -257,7 +292,7 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             small = moved < self.atol + self.rtol * self.norm(y)
         quiet = jnp.where(small, state.quiet + 1, 0)
         finite = enough & all_finite((fun, theta, scale))
-        progress = progress.after(y, fun, stderr, sigma, count, finite)
+        progress = progress.after(y, fun, stderr, sigma, count + tried, finite)
         after = GaussNewtonState(progress, scale, points, residuals, valid, quiet)
         before = eqx.tree_at(lambda s: s.progress, state, progress)
         new_y, state = unless_failed(finite, (new_y, after), (y, before))
