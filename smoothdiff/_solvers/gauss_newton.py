@@ -26,6 +26,7 @@ from smoothdiff._solvers._base import (
 )
 from smoothdiff._solvers._local_steps import TRIED, steps_to_try
 from smoothdiff._solvers._parameter_regression import gauss_newton_step
+from smoothdiff._solvers._residual_history import History
 
 # the longest step of any parameter, in units of its sigma: beyond it nothing has been seen
 _LONGEST = 2.0
@@ -42,13 +43,15 @@ _PATIENCE = 3
 
 
 class GaussNewtonState(eqx.Module):
-    """The state of `GaussNewton`: the width, and a history of points with their residuals."""
+    """The state of `GaussNewton`: the width, and a history of points with their residuals.
+
+    `seen` says that the last samples were not all the same, `quiet` counts small steps in a row.
+    """
 
     progress: Progress
     scale: Float[Array, ""]
-    points: Float[Array, "M n"]
-    residuals: Float[Array, "M P"]
-    valid: Bool[Array, " M"]
+    history: History
+    seen: Bool[Array, ""]
     quiet: Int[Array, ""]
 
 
@@ -87,7 +90,9 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             error of the step asks for, and grows where all samples are the same. An optax
             schedule, a function from the number of the step to a number, is taken as it is.
         num_samples: evaluations a step, the one at the iterate included. By default
-            4 + 3 log(n) for n parameters, for more than about 24 of them n / 2, at most 96.
+            4 + 3 log(n) for n parameters at first and while all samples are the same, later at
+            most n, but at least 2, as the history has the others. For more than about 24
+            parameters n / 2, at most 96.
         history: evaluations to keep, whose points and residuals are in memory. By default 12 n,
             but at least 64 and at most 256, and never less than three steps; four steps for 100
             parameters and more.
@@ -167,20 +172,22 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         self.norm = norm
 
     def evaluations_per_step(self, y: PyTree[Array]) -> int:
-        """One batch."""
-        n = sum(leaf.size for leaf in jax.tree.leaves(y))
-        if self.num_samples is not None:
-            return self.num_samples
-        return max(int(4 + 3 * math.log(n)), min(n // 2, _MOST))
+        """One batch, as large as the first, and the steps that are tried."""
+        first, _, tried = self._evaluations(y)
+        return first + tried
 
     def final_evaluations(self, y: PyTree[Array]) -> int:
         """A batch for each of the two candidates."""
         return 2 * self.evaluations_per_step(y)
 
-    def _tried(self, y: PyTree[Array]) -> int:
-        """How many steps are evaluated to find the best: none with few parameters."""
+    def _evaluations(self, y: PyTree[Array]) -> tuple[int, int, int]:
+        """Samples of a first batch, and of a later one; and how many steps are tried."""
         n = sum(leaf.size for leaf in jax.tree.leaves(y))
-        return 0 if n < _MANY or self.evaluations_per_step(y) < 3 * TRIED else TRIED
+        first = self.num_samples or max(int(4 + 3 * math.log(n)), min(n // 2, _MOST))
+        # what the history has need not be seen again
+        later = first if self.num_samples else min(first, max(2, n))
+        tried = TRIED if n >= _MANY and first >= 3 * TRIED else 0
+        return first - tried, later - tried, tried
 
     def _best(self, fn, args, params: Params, sigma, steps, here) -> tuple[Array, Array]:
         """The step that leads to the smallest sum of squares, if that is a smaller one."""
@@ -198,14 +205,15 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         return params
 
     def _evaluate(self, fn, args, params: Params, points: Array) -> tuple[Array, PyTree]:
-        """Residuals as rows, and aux, at points of the parameters as rows."""
+        """Residuals as rows, and aux of the first, at points of the parameters as rows."""
 
         def row(x: Array) -> tuple[Array, PyTree]:
             out, aux = fn(params.layout.tree(x), args)
             leaves = [jnp.ravel(leaf).astype(x.dtype) for leaf in jax.tree.leaves(out)]
             return jnp.concatenate(leaves), aux
 
-        return jax.lax.map(row, points, batch_size=self.batch_size or len(points))
+        rows, aux = jax.lax.map(row, points, batch_size=self.batch_size or len(points))
+        return rows, jax.tree.map(lambda a: a[0], aux)
 
     def _sample(self, params: Params, key: Array, sigma: Array, count: int) -> Array:
         """Points around the parameters, within the bounds."""
@@ -227,18 +235,17 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
                     "numbers: use .astype(float)"
                 )
         n, dtype = params.theta.size, params.theta.dtype
-        samples = self.evaluations_per_step(y) - self._tried(y)
+        first, *_ = self._evaluations(y)
         if self.history is None:
-            history = max(min(max(12 * n, 64), 256), (3 if n < _MANY else 4) * samples)
+            length = max(min(max(12 * n, 64), 256), (3 if n < _MANY else 4) * first)
         else:
-            history = max(self.history, samples)
+            length = max(self.history, first)
         size = sum(leaf.size for leaf in leaves)
         return GaussNewtonState(
             Progress.start(y, dtype),
             jnp.asarray(1, dtype),
-            jnp.zeros((history, n), dtype),
-            jnp.zeros((history, size), dtype),
-            jnp.zeros(history, bool),
+            History.empty(length, n, size, dtype),
+            jnp.asarray(False),
             start,
         )
 
@@ -247,22 +254,28 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         progress = state.progress
         params = self._params(y, progress.step, options)
         key = jax.random.fold_in(read_options(options)[0], progress.step)
-        count = self.evaluations_per_step(y)
+        first, later, tried = self._evaluations(y)
         sigma = params.sigma * state.scale
-        tried = self._tried(y)
-        count = count - tried
-        around = self._sample(params, key, sigma, count - 1)
-        new = jnp.concatenate([params.theta[None], around])
-        batch, aux = self._evaluate(fn, args, params, new)
-        good = jnp.isfinite(batch).all(axis=1)
-        enough = jnp.all(good) if self.nonfinite == "propagate" else 2 * jnp.sum(good) >= count
+        new = jnp.concatenate([params.theta[None], self._sample(params, key, sigma, first - 1)])
+
+        def evaluate(count: int) -> tuple[Array, PyTree]:
+            rows, aux = self._evaluate(fn, args, params, new[:count])
+            return jnp.pad(rows, ((0, first - count), (0, 0))), aux
+
+        if later == first:
+            count, (batch, aux) = jnp.asarray(first), evaluate(first)
+        else:
+            count = jnp.where(state.seen, later, first)
+            batch, aux = jax.lax.cond(state.seen, lambda: evaluate(later), lambda: evaluate(first))
+        good = (jnp.arange(first) < count) & jnp.isfinite(batch).all(axis=1)
+        lost = count - jnp.sum(good)
+        enough = lost == 0 if self.nonfinite == "propagate" else 2 * lost <= count
         batch = jnp.where(good[:, None], batch, 0)
-        points = jnp.concatenate([state.points[count:], new])
-        residuals = jnp.concatenate([state.residuals[count:], batch])
-        valid = jnp.concatenate([state.valid[count:], good])
+        history = state.history.after(new, batch, good, count)
+        residuals, valid = history.residuals, history.valid
 
         fun, stderr = _mean(jnp.sum(batch**2, axis=1) / 2, good)
-        u = (points - params.theta[None]) / sigma[None]
+        u = (history.points - params.theta[None]) / sigma[None]
         sides = [
             None if side is None else (side - params.theta) / sigma
             for side in (params.low, params.high)
@@ -273,7 +286,7 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         longest = jnp.max(jnp.abs(move))
         move = move / jnp.maximum(1, longest / _LONGEST)
         if tried:
-            steps = steps_to_try(move, u, residuals, valid, batch[0], count, *sides)
+            steps = steps_to_try(move, u, residuals, valid, batch[0], first, *sides)
             move, longest = self._best(fn, args, params, sigma, steps, batch[0])
         theta = params.clip(params.theta + sigma * move)
         same = jnp.all(jnp.where(good[:, None], batch == batch[jnp.argmax(good)][None], True))
@@ -284,7 +297,9 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             extent = jnp.max(jnp.where(plateau, jnp.sqrt(jnp.mean(u**2, axis=1)), 0))
             wanted = jnp.maximum(2 * jnp.sqrt(jnp.mean(error**2)), longest / _LONGEST)
             wanted = jnp.clip(jnp.maximum(wanted, extent), _SHRINK, _GROW)
-            scale = jnp.where(same, 2 * scale, jnp.minimum(wanted * scale, _WIDEST))
+            # a few that are the same call for more of them first
+            alone = same & (count == first)
+            scale = jnp.where(alone, 2 * scale, jnp.minimum(wanted * scale, _WIDEST))
 
         new_y = params.layout.tree(theta)
         with promotion():
@@ -293,10 +308,10 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         quiet = jnp.where(small, state.quiet + 1, 0)
         finite = enough & all_finite((fun, theta, scale))
         progress = progress.after(y, fun, stderr, sigma, count + tried, finite)
-        after = GaussNewtonState(progress, scale, points, residuals, valid, quiet)
+        after = GaussNewtonState(progress, scale, history, ~same, quiet)
         before = eqx.tree_at(lambda s: s.progress, state, progress)
         new_y, state = unless_failed(finite, (new_y, after), (y, before))
-        return new_y, state, jax.tree.map(lambda a: a[0], aux)
+        return new_y, state, aux
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """After small steps in a row, or a failed one."""
@@ -329,4 +344,5 @@ def _mean(values: Array, good: Array) -> tuple[Array, Array]:
     count = jnp.sum(good).astype(values.dtype)
     mean = jnp.sum(jnp.where(good, values, 0)) / count
     square = jnp.sum(jnp.where(good, (values - mean) ** 2, 0))
-    return mean, jnp.sqrt(square / (count * (count - 1)))
+    stderr = jnp.sqrt(square / jnp.maximum(count * (count - 1), 1))
+    return mean, jnp.where(count > 1, stderr, jnp.inf)

@@ -1,0 +1,36 @@
+"""The last evaluations of residuals: where they were made, what came, and which of them count."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+
+class History(eqx.Module):
+    """Rows from the oldest to the newest; at first all of them are empty, and not `valid`."""
+
+    points: Float[Array, "M n"]
+    residuals: Float[Array, "M P"]
+    valid: Bool[Array, " M"]
+
+    @staticmethod
+    def empty(length: int, n: int, size: int, dtype) -> "History":
+        """Of so many evaluations at n parameters, with so many residuals each."""
+        return History(
+            jnp.zeros((length, n), dtype), jnp.zeros((length, size), dtype), jnp.zeros(length, bool)
+        )
+
+    def after(
+        self,
+        points: Float[Array, "m n"],
+        residuals: Float[Array, "m P"],
+        valid: Bool[Array, " m"],
+        count: Int[Array, ""],
+    ) -> "History":
+        """With the first `count` of these rows in place of as many of the oldest."""
+
+        def latest(old: Array, new: Array) -> Array:
+            return jax.lax.dynamic_slice_in_dim(jnp.concatenate([old, new]), count, len(old))
+
+        new = History(points, residuals, valid)
+        return jax.tree.map(latest, self, new)
