@@ -191,7 +191,9 @@ def _watched(task: Task, counter: Counter) -> Task:
         if (fun := getattr(task, name)) is not None:
             watched[name] = counter.watch(fun)
     if (grey := task.grey) is not None:
-        watched["grey"] = grey._replace(black=counter.watch(grey.black))
+        parts = {"black": grey.black, "residuals": grey.residuals}
+        seen = {name: counter.watch(part) for name, part in parts.items() if part is not None}
+        watched["grey"] = grey._replace(**seen)
         watched["loss"] = watched["grey"].loss
     if (native_ad := task.native_ad) is not None:
         watched["native_ad"] = lambda: counter.watch_native_ad(native_ad())

@@ -10,8 +10,8 @@ from jax.flatten_util import ravel_pytree
 
 from benchmarks import methods, tasks
 from benchmarks._harness import Counter, _watched
-from benchmarks._task import Budget, Grey, Task
-from benchmarks.methods import grey_box
+from benchmarks._task import Budget, Grey, NotAble, Task
+from benchmarks.methods import grey_box, grey_gauss_newton
 from benchmarks.scenes import mesh_renderer, meshes, soft_mesh
 from benchmarks.tasks import caustic, suzanne, texture32
 
@@ -159,13 +159,16 @@ def linear_grey(sigma: float = 0.5) -> Task:
     weights = jnp.array([[1.0, -2.0, 0.5, 0.3], [0.2, 0.4, -1.0, 0.1]])
     answers = inputs @ weights.T
 
+    def residuals(x, case):
+        return x - answers[case]
+
     def black(x, case):
-        return jnp.sum((x - answers[case]) ** 2)
+        return jnp.sum(residuals(x, case) ** 2)
 
     def white(y, case):
         return y.reshape(2, 4) @ inputs[case]
 
-    grey = Grey(white, black, jnp.arange(16), sigma)
+    grey = Grey(white, black, jnp.arange(16), sigma, residuals)
     reference = weights.ravel()
     return Task(
         name="linear",
@@ -196,17 +199,16 @@ def standard_promotion():
         yield
 
 
-@pytest.mark.parametrize("name", grey_box.VARIANTS)
-def test_grey_boxes_train_a_network(name, monkeypatch, standard_promotion):
-    monkeypatch.setattr(grey_box, "RATE", 0.05)
+class Done(Exception):
+    """Ends a method."""
+
+
+def trained(prepare, rate: tuple, monkeypatch) -> tuple[Task, list, int]:
+    """A task, the weights after each step, and evaluations a step."""
+    monkeypatch.setattr(*rate)
     counter = Counter()
     task = dataclasses.replace(linear_grey(), budget=Budget(8 * 4 * 150, 60))
-    watched = _watched(task, counter)
-    title, prepare = grey_box.VARIANTS[name]
     found = []
-
-    class Done(Exception):
-        pass
 
     def record(y):
         found.append(np.asarray(y))
@@ -214,17 +216,39 @@ def test_grey_boxes_train_a_network(name, monkeypatch, standard_promotion):
             raise Done
 
     with pytest.raises(Done):
-        prepare(watched)(task.start(0), jax.random.key(0), record)
+        prepare(_watched(task, counter))(task.start(0), jax.random.key(0), record)
     assert counter.evaluations % len(found) == 0
-    per_step = counter.evaluations // len(found)
+    return task, found, counter.evaluations // len(found)
+
+
+@pytest.mark.parametrize("name", grey_box.VARIANTS)
+def test_grey_boxes_train_a_network(name, monkeypatch, standard_promotion):
+    title, prepare = grey_box.VARIANTS[name]
+    task, found, per_step = trained(prepare, (grey_box, "RATE", 0.05), monkeypatch)
     assert per_step in (8 * 2, 8 * 4)
     assert task.loss(found[-1]) < 0.05 * task.loss(task.start(0))
     assert title
 
 
-def test_grey_boxes_need_a_part_that_ad_knows():
-    from benchmarks._task import NotAble
+def test_gauss_newton_finds_what_a_network_is_to_answer(monkeypatch, standard_promotion):
+    task, found, per_step = trained(
+        grey_gauss_newton.prepare, (grey_gauss_newton, "RATE", 0.05), monkeypatch
+    )
+    # all cases at once; a step of each, and two to choose between the network and the solver
+    assert per_step == 16 * (6 + 2)
+    assert task.loss(found[-1]) < 1e-4 * task.loss(task.start(0))
 
+
+@pytest.mark.parametrize("missing", ["grey", "residuals"])
+def test_gauss_newton_needs_residuals_behind_a_network(missing):
+    task = linear_grey()
+    assert task.grey is not None
+    grey = None if missing == "grey" else task.grey._replace(residuals=None)
+    with pytest.raises(NotAble, match="residuals"):
+        grey_gauss_newton.prepare(dataclasses.replace(task, grey=grey))
+
+
+def test_grey_boxes_need_a_part_that_ad_knows():
     _, prepare = grey_box.VARIANTS["grey_fr22"]
     with pytest.raises(NotAble, match="AD"):
         prepare(built("caustic"))

@@ -146,6 +146,7 @@ def stairs(evaluations: int) -> Task:
     [
         ("local_cross_entropy", 320, 1e-3, 32),
         ("local_gradient", 480, 0.02, 8),
+        ("local_first_order", 480, 0.2, 8),
         ("cma_es_diagonal", 2000, 0.2, 18),
     ],
 )
@@ -162,7 +163,9 @@ def test_many_parameters(name, evaluations, left, batch):
     assert np.all((found >= 0) & (found <= 1))
 
 
-@pytest.mark.parametrize("name", ["local_cross_entropy", "local_gradient", "cma_es_diagonal"])
+@pytest.mark.parametrize(
+    "name", ["local_cross_entropy", "local_gradient", "local_first_order", "cma_es_diagonal"]
+)
 def test_methods_for_many_parameters_say_what_they_need(name):
     with pytest.raises(NotAble, match=r"parameters or more|local support"):
         methods.load(name).prepare(bowl()[0])

@@ -156,8 +156,8 @@ def scene(name="shadow", dimensions=2, **found):
         (FEW + 1, {"gauss_newton": 2, "newton_cg": 1, "first_order": 3}, "first_order"),
         (
             FEW + 1,
-            {"gauss_newton": 2, "local_gradient": 9, "first_order": 3},
-            "local_gradient",
+            {"gauss_newton": 2, "local_first_order": 9, "first_order": 3},
+            "local_first_order",
         ),
         (2, {"fr22": 2}, None),
     ],

@@ -1,11 +1,16 @@
-"""The smoothed gradient with local support, and Adam. Sigma begins wide and falls geometrically.
+"""The smoothed gradient with local support, and Adam. Sigma falls geometrically, and steps with it.
 
-Each parameter sees only the noise of its own terms, so sigma can be half of the domain at first,
-where the wrong valleys are not seen yet. It falls over a number of evaluations that is the same for
-all tasks, and steps fall with it.
+Each parameter sees only the noise of its own terms, so few samples are enough for thousands of
+parameters. What differs is where sigma begins:
+
+* at half of the domain, where wrong valleys are not seen yet, and in few evaluations, the same
+  number for all tasks;
+* at the task's sigma, and over the budget, as for `first_order`, which has no support.
 """
 
 import itertools
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,26 +18,47 @@ import optax
 
 import smoothdiff as sd
 from benchmarks._task import Solve, Task
+from benchmarks.methods._flat import Flat
 from benchmarks.methods._local import local
+from benchmarks.methods.first_order import BETAS, RATE, SIGMA_END
 
-TITLE = "Smoothed gradient, local support, Adam (ours)"
 NUM_SAMPLES = 8
-SIGMA, SIGMA_END = 0.5, 0.003  # of the domain
+WIDEST, NARROWEST = 0.5, 0.003  # of the domain
 EVALUATIONS = 450  # until sigma has fallen
-STEP = 0.7  # in units of sigma
-BETAS = 0.5, 0.9  # a short memory, as sigma falls fast
 
 
-def prepare(task: Task) -> Solve:
+class Course(NamedTuple):
+    """How a run goes: sigma after so many steps, the step in units of it, and Adam's memory."""
+
+    sigma: Any
+    step: float
+    betas: tuple[float, float]
+
+
+def from_the_domain(task: Task, flat: Flat) -> Course:
+    """Fast, with a short memory, as sigma falls fast."""
+    steps = EVALUATIONS // NUM_SAMPLES
+    share = optax.exponential_decay(WIDEST, steps, NARROWEST / WIDEST, end_value=NARROWEST)
+    domain = flat.high - flat.low
+    return Course(lambda i: jnp.asarray(share(i), flat.dtype) * domain, 0.7, (0.5, 0.9))
+
+
+def from_the_sigma(task: Task, flat: Flat) -> Course:
+    """As `first_order`."""
+    steps = task.budget.evaluations // NUM_SAMPLES
+    share = optax.exponential_decay(1.0, steps, SIGMA_END, end_value=SIGMA_END)
+    return Course(lambda i: jnp.asarray(share(i) * task.sigma, flat.dtype), RATE, BETAS)
+
+
+def prepare(task: Task, plan: Any) -> Solve:
     """Compiles a step."""
     flat, terms, support = local(task)
-    optim = optax.scale_by_adam(*BETAS)
-    steps = EVALUATIONS // NUM_SAMPLES
-    share_at = optax.exponential_decay(SIGMA, steps, SIGMA_END / SIGMA, end_value=SIGMA_END)
+    course: Course = plan(task, flat)
+    optim = optax.scale_by_adam(*course.betas)
 
     @jax.jit
     def step(key, x, state, i):
-        sigma = jnp.asarray(share_at(i), flat.dtype) * (flat.high - flat.low)
+        sigma = course.sigma(i)
         grad = sd.smooth_grad(
             terms,
             sigma,
@@ -43,7 +69,7 @@ def prepare(task: Task) -> Solve:
             bounds=(flat.low, flat.high),
         )
         direction, state = optim.update(grad(key, x), state)
-        return flat.clip(x - STEP * sigma * jnp.asarray(direction)), state
+        return flat.clip(x - course.step * sigma * jnp.asarray(direction)), state
 
     def solve(y0, key, record):
         x = jnp.asarray(flat.start(y0), flat.dtype)
@@ -53,3 +79,15 @@ def prepare(task: Task) -> Solve:
             record(flat.tree(x))
 
     return solve
+
+
+VARIANTS = {
+    "local_gradient": (
+        "Smoothed gradient, local support, Adam (ours)",
+        partial(prepare, plan=from_the_domain),
+    ),
+    "local_first_order": (
+        "First order, local support (ours)",
+        partial(prepare, plan=from_the_sigma),
+    ),
+}

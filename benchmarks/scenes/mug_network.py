@@ -26,7 +26,7 @@ from benchmarks.scenes._mitsuba_task import UP
 FRONT = np.pi  # the angle at which the handle points at the camera
 SIGMA, BOUND = 0.025, 50.0  # of the weights, for methods that know of nothing else
 CHANNELS, GRID, UNITS = 16, 8, 256
-SPP = 4  # samples per pixel
+SPP, SCORE_SPP = 4, 16  # samples per pixel, and those of pictures by which a network is judged
 SHOWN = 6  # pictures of those that were not trained on
 
 Params = Mapping[str, Callable[[Array], Array]]
@@ -46,12 +46,18 @@ class Network(eqx.Module):
         self.layers = [eqx.nn.Linear(*s, key=next(keys)) for s in sizes]
 
     def hidden(self, picture: Float[Array, "size size 3"]) -> Float[Array, "units"]:
-        """What the last layer sees."""
-        x = jnp.moveaxis(picture, 2, 0)
+        """What the last layer sees. Channels stay last, as that takes half of the time."""
+        x = picture
         for convolution in self.convolutions:
-            x = jax.nn.relu(convolution(x))
-            if x.shape[1] > GRID:
-                x = x.reshape(CHANNELS, x.shape[1] // 2, 2, x.shape[2] // 2, 2).max((2, 4))
+            x = jax.lax.conv_general_dilated(
+                *(x[None], convolution.weight, (1, 1), "SAME"),
+                dimension_numbers=("NHWC", "OIHW", "NHWC"),
+            )[0]
+            assert convolution.bias is not None
+            x += jnp.ravel(convolution.bias)
+            if len(x) > GRID:
+                x = x.reshape(len(x) // 2, 2, len(x) // 2, 2, CHANNELS).max((1, 3))
+            x = jax.nn.relu(x)
         return jax.nn.relu(self.layers[0](x.ravel()))
 
     def __call__(self, picture: Float[Array, "size size 3"]) -> Float[Array, "outputs"]:
@@ -70,7 +76,8 @@ def network_task(
 ) -> Task:
     """The task of training the network. Its weights are y.
 
-    Quick: 32 x 32 pixels, 64 pictures to train on; full: 64 x 64 and 256.
+    Quick: 32 x 32 pixels, 256 pictures to train on; full: 64 x 64 and 1,024. With fewer, also a
+    network that is told all poses fails on others: with 64 of CNN 22 % of the loss are left.
 
     Args:
         full: As for all tasks.
@@ -88,14 +95,15 @@ def network_task(
 
     mi.set_variant("scalar_rgb")
     scene = mug.scene(mi.ScalarTransform4f())
-    size, cases, held_out = (64, 256, 64) if full else (32, 64, 32)
+    size, cases, held_out = (64, 1024, 64) if full else (32, 256, 32)
 
-    box = mitsuba.renderer(
-        scene, list(params), axis=UP, resolution=size, spp=SPP, variant="scalar_rgb"
-    )
+    def renderer(spp: int) -> Callable[[Float[Array, "outputs"]], Float[Array, "size size 3"]]:
+        box = mitsuba.renderer(
+            scene, list(params), axis=UP, resolution=size, spp=spp, variant="scalar_rgb"
+        )
+        return lambda pose: box({key: value(pose) for key, value in params.items()})
 
-    def render(pose: Float[Array, "outputs"]) -> Float[Array, "size size 3"]:
-        return box({key: value(pose) for key, value in params.items()})
+    render, cleaner = renderer(SPP), renderer(SCORE_SPP)
 
     poses = np.random.default_rng(0).uniform(-1, 1, (cases + held_out, len(spread)))
     poses = jnp.asarray(poses * spread, jnp.float32)
@@ -103,6 +111,7 @@ def network_task(
     inputs = pictures - jnp.mean(pictures, axis=0, keepdims=True)
     inputs /= jnp.std(inputs)
     unseen = jnp.arange(cases, cases + held_out)
+    clean = jax.jit(jax.vmap(cleaner))(poses[unseen])
 
     def initial(seed: int) -> Network:
         return Network(len(spread), jax.random.key(seed))
@@ -116,8 +125,15 @@ def network_task(
     def white(y: Float[Array, "weights"], case: Array) -> Float[Array, "outputs"]:
         return eqx.combine(unravel(y), rest)(inputs[case])
 
+    def residuals(pose: Float[Array, "outputs"], case: Array) -> Float[Array, "size size 3"]:
+        return render(pose) - pictures[case]
+
     def black(pose: Float[Array, "outputs"], case: Array) -> Float[Array, ""]:
-        return jnp.mean((render(pose) - pictures[case]) ** 2)
+        return jnp.mean(residuals(pose, case) ** 2)
+
+    def exact_loss(y: Float[Array, "weights"]) -> Float[Array, ""]:
+        seen = jax.vmap(lambda case: cleaner(white(y, case)))(unseen)
+        return jnp.mean((seen - clean) ** 2)
 
     def distance(y: Float[Array, "weights"]) -> Float[Array, ""]:
         said = jax.vmap(lambda case: white(y, case))(unseen)
@@ -128,13 +144,13 @@ def network_task(
     def image(y: Float[Array, "weights"]) -> Float[Array, "size width 3"]:
         return jnp.concatenate([render(white(y, case)) for case in unseen[:SHOWN]], axis=1)
 
-    grey = Grey(white, black, jnp.arange(cases), sigma)
-    reference = flat(solved(initial(2**31), inputs, poses))
+    grey = Grey(white, black, jnp.arange(cases), sigma, residuals)
+    reference = flat(solved(initial(2**31), inputs, poses, held_out))
     return Task(
         name=name,
         title=title,
         loss=grey.loss,
-        exact_loss=grey._replace(cases=unseen).loss,
+        exact_loss=exact_loss,
         start=lambda seed: flat(initial(seed)),
         reference=reference,
         bounds=(jnp.full_like(reference, -BOUND), jnp.full_like(reference, BOUND)),
@@ -145,12 +161,19 @@ def network_task(
         grey=grey,
         distance=distance,
         notes=f"{cases} pictures of {size} x {size} pixels, {SPP} samples per pixel. An evaluation "
-        f"is a render. Errors are those on {held_out} other pictures; parameters are poses.",
+        f"is a render. Errors are those on {held_out} other pictures, by renders with {SCORE_SPP} "
+        "samples per pixel; parameters are poses.",
     )
 
 
-def solved(network: Network, pictures: Array, poses: Array) -> Network:
-    """The network with another last layer, one that knows the poses of all pictures."""
+def solved(network: Network, pictures: Array, poses: Array, exact: int) -> Network:
+    """The network with another last layer, one that knows the poses of all pictures.
+
+    About: as well as 256 units can. The poses of the last few pictures, `exact` of them, it knows.
+    """
     features = jax.vmap(network.hidden)(pictures)
-    last = networks.last_layer(features, poses, 1e-4)
+    weights, bias = networks.last_layer(features, poses, 1e-4)
+    missing = poses[-exact:] - features[-exact:] @ weights.T - bias
+    more_weights, more_bias = networks.last_layer(features[-exact:], missing, 1e-4)
+    last = weights + more_weights, bias + more_bias
     return eqx.tree_at(lambda n: (n.layers[1].weight, n.layers[1].bias), network, last)

@@ -10,7 +10,10 @@ from benchmarks._task import Budget, Task
 from benchmarks.scenes import meshes, soft_mesh
 
 TITLE = "Suzanne: 7,686 coordinates of a mesh"
-METHODS = ("spsa", "fr22", "first_order", "zerograds", "local_gradient")
+METHODS = (
+    *("spsa", "fr22", "first_order", "zerograds"),
+    *("local_gradient", "local_first_order", "gauss_newton"),
+)
 REST = 0.8  # radius of the sphere
 SKULL = 0.75
 # where bumps of the skull are, how high, and how wide as an angle

@@ -27,6 +27,7 @@ METHODS = (
     "zerograds",
     "cma_es_diagonal",
     "local_gradient",
+    "local_first_order",
     "local_cross_entropy",
     "gauss_newton",
 )
