@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 DASHES = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1, 1, 1, 1, 1)))
 CROWDED = 8  # methods, beyond which a legend needs a side of its own
+HANDLE, LETTER = 0.6, 0.065  # inches, of a line in a legend and of what is written beside it
 STYLE: dict[Any, Any] = {
     "font.size": 9,
     "axes.titlesize": 10,
@@ -53,7 +54,9 @@ def legend(drawn: Figure, handles: list, labels: list[str]) -> None:
         drawn.set_size_inches(width + 3.5, max(height, 0.2 * len(labels) + 0.6))
         drawn.legend(handles, labels, loc="outside right center", handlelength=3.5)
     else:
-        drawn.legend(handles, labels, loc="outside lower center", ncols=min(3, len(labels)))
+        fitting = drawn.get_figwidth() / (HANDLE + LETTER * max(map(len, labels)))
+        ncols = max(1, min(3, len(labels), int(fitting)))
+        drawn.legend(handles, labels, loc="outside lower center", ncols=ncols)
 
 
 def looks(names) -> dict[str, dict]:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from benchmarks._task import Budget, Task
 from benchmarks.methods import grey_box
 
-TITLE = "CNN5: 268,773 weights of a network that sees a mug's rotation, position and colour"
+TITLE = "CNN5: 268,773 weights of a network that sees a mug's pose and colour"
 METHODS = (*grey_box.VARIANTS, "grey_gauss_newton")
 SPREAD = (1.5, 1.5, 1.5, 1.5, 1.5)
 SIGMA = 0.5
