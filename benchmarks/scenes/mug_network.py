@@ -54,7 +54,7 @@ class Network(eqx.Module):
                 dimension_numbers=("NHWC", "OIHW", "NHWC"),
             )[0]
             assert convolution.bias is not None
-            x += jnp.ravel(convolution.bias)
+            x += convolution.bias.reshape(1, 1, CHANNELS)
             if len(x) > GRID:
                 x = x.reshape(len(x) // 2, 2, len(x) // 2, 2, CHANNELS).max((1, 3))
             x = jax.nn.relu(x)
@@ -173,7 +173,7 @@ def solved(network: Network, pictures: Array, poses: Array, exact: int) -> Netwo
     """
     features = jax.vmap(network.hidden)(pictures)
     weights, bias = networks.last_layer(features, poses, 1e-4)
-    missing = poses[-exact:] - features[-exact:] @ weights.T - bias
+    missing = poses[-exact:] - features[-exact:] @ weights.T - bias[None]
     more_weights, more_bias = networks.last_layer(features[-exact:], missing, 1e-4)
     last = weights + more_weights, bias + more_bias
     return eqx.tree_at(lambda n: (n.layers[1].weight, n.layers[1].bias), network, last)
