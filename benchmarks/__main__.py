@@ -39,6 +39,7 @@ def main(arguments: list[str] | None = None, results: Path = RESULTS) -> None:
     commands.add_parser("stress", help="stiff and extreme cases: expected, seen, verdict")
     page = commands.add_parser("report", help="report.html, from the results of the scenes")
     page.add_argument("tasks", nargs="*", metavar="TASK", help="these; all scenes by default")
+    commands.add_parser("savings", help="what the savings of the scenes are worth in seconds")
     robustness = commands.add_parser("robustness", help="starts, samples, render noise, JPEG")
     robustness.add_argument("--full", action="store_true", help="more starts")
     options = parser.parse_args(arguments)
@@ -66,6 +67,10 @@ def main(arguments: list[str] | None = None, results: Path = RESULTS) -> None:
 
         setting = robustness.FULL if options.full else robustness.QUICK
         robustness.main(results / "robustness", command, setting=setting)
+    elif options.command == "savings":
+        from benchmarks import savings
+
+        savings.main(results / "savings")
     elif options.command == "zerograds":
         from benchmarks import zerograds
 

@@ -91,6 +91,8 @@ class Task:
             above it they are.
         choose: Makes the black box that of a seed, and returns the y that is sought then; or None
             where it is the same for all seeds.
+        dearer: The picture by dearer renders, by the name of the saving that each does without; ""
+            is the render as it is. Or None. Made when they are asked for, and not counted.
         notes: Facts that belong beside the results, resolution and variant, say.
     """
 
@@ -114,6 +116,7 @@ class Task:
     precision: Literal["float32", "float64"] = "float32"
     optimum: float | None = None
     choose: Callable[[int], Y] | None = None
+    dearer: Callable[[], dict[str, Callable[[Y], jax.Array]]] | None = None
     notes: str = ""
 
 

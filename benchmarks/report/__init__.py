@@ -3,7 +3,6 @@
 `python -m benchmarks report` reads what `python -m benchmarks run all` has written so far.
 """
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from benchmarks import tasks
 from benchmarks._task import NotAble, precision_of
 from benchmarks.report import _atlas, _page, _tables
 from benchmarks.report._grid import to_rich
-from benchmarks.report._scene import Scene, names
+from benchmarks.report._scene import load, names
 
 
 def main(results: Path, asked: Sequence[str] = ()) -> None:
@@ -26,13 +25,12 @@ def main(results: Path, asked: Sequence[str] = ()) -> None:
     console = Console()
     scenes = []
     for name in names(asked):
-        path = results / name / "results.json"
-        found = json.loads(path.read_text()) if path.exists() else {}
-        if "dimensions" not in found or not Scene(name, found).ran:
+        scene = load(name, results)
+        if scene is None:
             console.print(f"{name} has no results: python -m benchmarks run {name}")
             continue
-        scenes.append(Scene(name, found))
-        _render_missing(name, found, path.parent)
+        scenes.append(scene)
+        _render_missing(name, scene.results, results / name)
     if not scenes:
         return
     overall = _page.overall(scenes)

@@ -1,11 +1,12 @@
 """The page: HTML with everything in it, that a phone shows, a printer prints, and mail carries."""
 
+import json
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
 from benchmarks import tasks
-from benchmarks.report import _atlas, _goals, _panels, _tables
+from benchmarks.report import _atlas, _goals, _panels, _savings, _tables
 from benchmarks.report._grid import Grid, to_html
 from benchmarks.report._scene import RULE_TEXT, Scene
 
@@ -36,7 +37,8 @@ def page(scenes: Sequence[Scene], overall: Sequence[Grid], results: Path) -> str
         _preamble(scenes),
         f"<nav>{links}</nav>",
         *(to_html(grid, swatches) for grid in overall),
-        _robustness(results / "robustness" / "robustness.png"),
+        _saved(results / "savings", scenes, swatches),
+        _robustness(results / "robustness"),
         *(_section(scene, look, swatches, results / scene.name) for scene in scenes),
         "</body></html>\n",
     ]
@@ -145,14 +147,29 @@ def _curves(scene: Scene, look: _panels.Look) -> str:
     )
 
 
-def _robustness(picture: Path) -> str:
-    if not picture.exists():
+def _saved(folder: Path, scenes: Sequence[Scene], swatches: dict[str, str]) -> str:
+    picture = _picture(folder / "savings.png")
+    if not picture:
         return ""
-    source = _atlas.png_uri(picture.read_bytes())
-    return (
-        "<h2>Robustness</h2><p>Starts, samples of a step, samples of a pixel, and a reference that "
-        f'was a JPEG.</p><img class=wide alt="Robustness" src="{source}">'
+    table = _savings.table(json.loads((folder / "results.json").read_text()), scenes)
+    told = (
+        "What a scene does not need, it does not pay for; the scenes below say what they leave "
+        "out. Here is a render with all savings, and without each of them."
     )
+    return f"<h2>Savings</h2><p>{told}</p>{to_html(table, swatches)}{picture}"
+
+
+def _robustness(folder: Path) -> str:
+    picture = _picture(folder / "robustness.png")
+    told = "Starts, samples of a step, samples of a pixel, and a reference that was a JPEG."
+    return f"<h2>Robustness</h2><p>{told}</p>{picture}" if picture else ""
+
+
+def _picture(path: Path) -> str:
+    if not path.exists():
+        return ""
+    source = _atlas.png_uri(path.read_bytes())
+    return f'<img class=wide alt="{path.stem}" src="{source}">'
 
 
 def overall(scenes: Sequence[Scene]) -> list[Grid]:

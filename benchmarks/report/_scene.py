@@ -5,7 +5,9 @@ where parameters act locally, as README advises. It was set before anything was 
 once, after results of cnn5 and suzanne were seen: it named grey_ours and local_gradient before.
 """
 
+import json
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks import methods, tasks
@@ -81,6 +83,13 @@ class Scene(NamedTuple):
             return None
         one, other = (self.reached(name, error, level, cost).median for name in (method, to))
         return one / other if one and other else None
+
+
+def load(name: str, results: Path) -> Scene | None:
+    """What was run on a scene, by the folder of all results; None where nothing was."""
+    path = results / name / "results.json"
+    found = json.loads(path.read_text()) if path.exists() else {}
+    return Scene(name, found) if "dimensions" in found and Scene(name, found).ran else None
 
 
 def names(asked: Sequence[str]) -> list[str]:

@@ -15,7 +15,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from benchmarks._task import Budget, NativeAD, Task
+from benchmarks.scenes._dearer import dearer
 
+VARIANT = "scalar_rgb"
 EXACT, PHOTO = 9, 64  # times the samples, for the score and for the photograph
 UP = (0, 0, 1)  # what objects turn about that turn
 
@@ -66,12 +68,13 @@ def scene_task(
 
     from smoothdiff.renderers import mitsuba
 
-    mi.set_variant("scalar_rgb")  # transforms cannot be made before
+    mi.set_variant(VARIANT)  # transforms cannot be made before
     described = scene(mi.ScalarTransform4f())
 
+    settings: Any = {"axis": UP, "resolution": resolution, "variant": VARIANT}
+
     def renderer(spp: int, seed: int = 0) -> Callable[[Array], Array]:
-        settings = {"axis": UP, "resolution": resolution, "spp": spp, "seed": seed}
-        render = mitsuba.renderer(described, list(params), variant="scalar_rgb", **settings)
+        render = mitsuba.renderer(described, list(params), spp=spp, seed=seed, **settings)
         return lambda y: render({key: value(y) for key, value in params.items()})
 
     sought = jnp.asarray(reference, jnp.float32)
@@ -107,7 +110,8 @@ def scene_task(
         image=image,
         residuals=lambda y: render(y) - photo,
         native_ad=native_ad if ad_integrator else None,
-        notes=f"{resolution} x {resolution} pixels, {spp} samples per pixel, scalar_rgb",
+        dearer=lambda: dearer(scene, params, spp=spp, **settings),
+        notes=f"{resolution} x {resolution} pixels, {spp} samples per pixel, {VARIANT}",
     )
 
 

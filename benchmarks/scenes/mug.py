@@ -34,8 +34,8 @@ RING, TUBE = 0.6, 0.16  # radii of the handle
 AROUND, ALONG = 12, 32  # a coarse tube has edges that Mitsuba's own AD misses
 
 
-def build(full: bool) -> Task:
-    """y is the angle in radians."""
+def build(full: bool, spp: int = 4) -> Task:
+    """y is the angle in radians; `spp` are samples of a pixel, a square."""
     return scene_task(
         full,
         name="mug",
@@ -47,6 +47,7 @@ def build(full: bool) -> Task:
         start_box=([-0.6], [1.4]),
         sigma=0.8,
         budget=Budget(evaluations=400, seconds=30),
+        spp=spp,
         ad_integrator=DIRECT_AD,
     )
 

@@ -8,12 +8,13 @@ from benchmarks._task import Budget, NotAble, Task
 TITLE = "Shadow: position of an unseen sphere"
 
 
-def build(full: bool) -> Task:
-    """Quick: 32 x 32 pixels and 5 starts; full: 64 x 64 and 20."""
+def build(full: bool, spp: int = 4) -> Task:
+    """Quick: 32 x 32 pixels and 5 starts; full: 64 x 64 and 20. `spp` are samples of a pixel."""
     from benchmarks.scenes import shadow
+    from benchmarks.scenes._dearer import dearer
     from smoothdiff.renderers.mitsuba import available
 
-    resolution, spp, exact_spp = (64, 4, 32) if full else (32, 4, 64)
+    resolution, exact_spp = (64, 32) if full else (32, 64)
     variant = "llvm_ad_rgb" if available("llvm_ad_rgb") else "scalar_rgb"
     render, photo = shadow.make(resolution, spp, variant)
     image, _ = shadow.make(resolution, exact_spp, variant)
@@ -29,6 +30,15 @@ def build(full: bool) -> Task:
             raise NotAble("needs libllvm >= 17, for Mitsuba's variant llvm_ad_rgb")
         return shadow.native_ad(resolution, spp, photo, variant)
 
+    def without_savings():
+        return dearer(
+            lambda world: shadow.scene_dict(resolution),
+            {"ball.translate": lambda y: jnp.insert(y, 1, 0.0)},
+            resolution=resolution,
+            spp=spp,
+            variant=variant,
+        )
+
     return Task(
         name="shadow",
         title=TITLE,
@@ -43,5 +53,6 @@ def build(full: bool) -> Task:
         image=image,
         residuals=lambda y: render(y) - photo,
         native_ad=native_ad,
+        dearer=without_savings,
         notes=f"{resolution} x {resolution} pixels, {spp} samples per pixel, {variant}",
     )
