@@ -42,6 +42,7 @@ def main(arguments: list[str] | None = None, results: Path = RESULTS) -> None:
     commands.add_parser("savings", help="what the savings of the scenes are worth in seconds")
     robustness = commands.add_parser("robustness", help="starts, samples, render noise, JPEG")
     robustness.add_argument("--full", action="store_true", help="more starts")
+    robustness.add_argument("--fresh", action="store_true", help="run again what has been run")
     options = parser.parse_args(arguments)
     command = " ".join(["python -m benchmarks", *arguments])
 
@@ -66,7 +67,8 @@ def main(arguments: list[str] | None = None, results: Path = RESULTS) -> None:
         from benchmarks import robustness
 
         setting = robustness.FULL if options.full else robustness.QUICK
-        robustness.main(results / "robustness", command, setting=setting)
+        folder = results / "robustness"
+        robustness.main(folder, command, setting=setting, fresh=options.fresh)
     elif options.command == "savings":
         from benchmarks import savings
 

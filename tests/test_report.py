@@ -1,10 +1,9 @@
-"""The report of the scenes, the command that runs all of them, and the study of robustness.
+"""The report of the scenes, and the command that runs all of them.
 
 This module is itself a task and some methods that the command line is given.
 """
 
 import json
-import math
 import os
 import signal
 import subprocess
@@ -19,12 +18,11 @@ import numpy as np
 import pytest
 
 from benchmarks import __main__ as cli
-from benchmarks import methods, robustness, tasks
+from benchmarks import methods, tasks
 from benchmarks._summary import _of_method
 from benchmarks._task import Budget, NotAble, Task
 from benchmarks.report import _atlas, _goals, _paper, _tables
 from benchmarks.report._scene import FEW, RULE, Scene
-from benchmarks.robustness import _studies
 
 TITLE = "A bowl"
 SIDE = 8  # pixels
@@ -371,65 +369,6 @@ def test_the_usual_methods_of_a_scene_are_methods():
     assert set(methods.SCENES) <= set(methods.METHODS)
     for name in tasks.ALL_SCENES:
         assert set(getattr(tasks.module(name), "METHODS", ())) <= set(methods.METHODS)
-
-
-def test_a_jpeg_is_as_far_off_as_its_level_says():
-    grey = np.random.default_rng(0).uniform(size=(32, 32, 1))
-    picture = np.repeat(grey, 3, axis=2)
-    size = math.sqrt(np.mean(picture**2))
-    for level in (0.02, 0.06, 0.14):
-        error, quality = _studies._jpeg(picture, level)
-        assert math.sqrt(np.mean(error**2)) / size == pytest.approx(level, rel=0.1)
-        assert quality is not None
-    nothing, none = _studies._jpeg(picture, 0)
-    assert none is None
-    assert not nothing.any()
-
-
-def test_a_compressed_reference_moves_the_residuals_only():
-    task = build(full=False)
-    changed = _studies._compressed(task, 14)
-    assert changed.residuals is not None
-    assert float(changed.loss(task.reference)) > 0
-    assert changed.exact_loss is task.exact_loss
-    assert float(changed.loss(task.reference)) == pytest.approx(
-        float(jnp.mean(changed.residuals(task.reference) ** 2))
-    )
-
-
-def test_starts_anywhere_are_within_the_bounds():
-    task = _studies._started_anywhere(build(full=False))
-    starts = np.stack([task.start(seed) for seed in range(50)])
-    assert np.all((starts >= 0) & (starts <= 1))
-    assert starts.std(axis=0) == pytest.approx(12**-0.5, rel=0.25)
-
-
-def test_robustness_is_measured_drawn_and_resumed(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(robustness, "SCENES", ("stripes", "not-there"))
-    monkeypatch.setitem(tasks.TASKS, "stripes", __name__)
-    monkeypatch.setitem(methods.METHODS, "halving", __name__)
-    monkeypatch.setattr(_studies, "USUAL", ("halving",))
-    monkeypatch.setattr(_studies, "_sampling", lambda num: [methods.load("halving")])
-    monkeypatch.setenv("COLUMNS", "150")
-    setting = robustness.Setting("quick", starts=5, seeds=1)
-    robustness.main(tmp_path, "the command", setting=setting)
-    assert "robustness" in capsys.readouterr().out.lower()
-    first = (tmp_path / "results.json").read_text()
-    results = json.loads(first)
-    (starts,) = results["scenes"]["stripes"]["starts"]["halving"]
-    assert len(starts["begun"]) == len(starts["ended"]) == 5
-    assert max(starts["ended"]) < 0.1
-    assert (tmp_path / "robustness.png").read_bytes().startswith(b"\x89PNG")
-    robustness.main(tmp_path, "the command", setting=setting)
-    assert (tmp_path / "results.json").read_text() == first
-
-
-def test_shadow_can_be_rendered_with_fewer_samples():
-    task = robustness._shadow_at(1)
-    usual = tasks.module("shadow").build(False)
-    at = lambda task: float(task.loss(usual.start(0)))
-    assert at(task) != at(usual)
-    assert at(task) == pytest.approx(at(usual), rel=0.3)
 
 
 def test_the_rule_names_methods_that_are_ours():

@@ -30,15 +30,10 @@ def draw(results: Results, path: Path) -> None:
         for i, (scene, studies) in enumerate(scenes.items()):
             above, below = axes[2 * i], axes[2 * i + 1]
             _starts(above[0], below[0], studies["starts"], look)
-            above[0].set_title(f"{scene}: starts")
-            for column, study in enumerate(AXES, start=1):
-                if study not in studies:
-                    above[column].set_visible(False)
-                    below[column].set_visible(False)
-                    continue
+            above[0].set_title(scene)
+            for column, (study, label) in enumerate(AXES.items(), start=1):
                 _study(above[column], below[column], studies[study], look)
-                above[column].set_title(f"{scene}: {AXES[study].lower()}")
-                below[column].set_xlabel(AXES[study])
+                below[column].set_xlabel(label)
         handles = [axes[0, 0].plot([], [], **look[name])[0] for name in titles]
         legend(drawn, handles, list(titles.values()))
 

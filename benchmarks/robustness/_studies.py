@@ -7,8 +7,8 @@ say what its 2 to 14 % are; on its scene, the mug, they then are qualities from 
 
 import dataclasses
 import io
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,48 +18,83 @@ from PIL import Image
 import smoothdiff as sd
 from benchmarks import methods
 from benchmarks._report import display
-from benchmarks._task import Method, Task
+from benchmarks._task import Method, Task, Y
 from benchmarks.methods._host_loop import run_by
 
 USUAL = ("fr22", "newton_cg", "gauss_newton")
 SAMPLES = (4, 6, 8, 12, 24)  # evaluations of a step; the defaults are 4 and 6 for 1 and 2 unknowns
-SPP = (1, 2, 4, 8, 12)  # 0.25 to 3 times the task's
+SPP = (1, 4, 9, 16)  # squares, which spread evenly; 0.25 to 4 times the task's
 JPEG = (0, 2, 4, 6, 9, 14)  # percent
 ANYWHERE = 0  # the study of starts has no value to vary
 
-Solver = Callable[..., Any]
+Residuals = Callable[[Y], jax.Array]
 
 
-class Case(NamedTuple):
-    """A task with one thing changed, and the methods that run on it."""
+class Change(NamedTuple):
+    """A study, one value of what it varies, and what the methods see then."""
 
     study: str
     value: int
-    task: Task
-    methods: list[Method]
+    residuals: Residuals
+    starts: list[Y]
 
 
-def cases(task: Task, at_spp: Callable[[int], Task] | None) -> list[Case]:
-    """All studies of a task; that of samples per pixel only where `at_spp` makes the task anew."""
-    usual = [methods.load(name) for name in USUAL]
-    found = [Case("starts", ANYWHERE, _started_anywhere(task), usual)]
-    found += [Case("samples", num, task, _sampling(num)) for num in SAMPLES]
-    if at_spp is not None:
-        found += [Case("spp", spp, at_spp(spp), usual) for spp in SPP]
-    return found + [Case("jpeg", level, _compressed(task, level), usual) for level in JPEG]
+def changes(build: Callable[..., Task], starts: int, seeds: int) -> list[Change]:
+    """All that is changed in the task itself.
+
+    Args:
+        build: The task, given `full` and, if it is to be other than usual, `spp`.
+        starts: How many starts, anywhere within the bounds, the study of starts has.
+        seeds: How many of its own starts each value of the others has.
+    """
+    task = build(False)
+    usual = [task.start(seed) for seed in range(seeds)]
+    return [
+        Change("starts", ANYWHERE, residuals(task), anywhere(task, starts)),
+        *(Change("spp", spp, residuals(build(False, spp=spp)), usual) for spp in SPP),
+        *(Change("jpeg", level, compressed(task, level), usual) for level in JPEG),
+    ]
 
 
-def _started_anywhere(task: Task) -> Task:
+def residuals(task: Task) -> Residuals:
+    """Those of the task, which has some."""
+    assert task.residuals is not None
+    return task.residuals
+
+
+def together(task: Task, changed: Sequence[Change]) -> Task:
+    """One task for all changes, so that a method compiles once: a seed is a change and a start."""
+    runs = [(i, start) for i, change in enumerate(changed) for start in change.starts]
+    chosen = [0]  # which change it is now; on the host, as what is compiled stays
+
+    def choose(seed: int) -> Y:
+        chosen[0] = runs[seed % len(runs)][0]
+        return task.reference
+
+    def of_chosen(y: Y) -> jax.Array:
+        index = jax.ShapeDtypeStruct((), jnp.int32)
+        which = jax.pure_callback(lambda: np.asarray(chosen[0], np.int32), index)
+        return jax.lax.switch(which, [change.residuals for change in changed], y)
+
+    return dataclasses.replace(
+        task,
+        residuals=of_chosen,
+        loss=lambda y: jnp.mean(of_chosen(y) ** 2),
+        start=lambda seed: runs[seed % len(runs)][1],
+        choose=choose,
+        native_ad=None,
+        notes=repr([(change.study, change.value, len(change.starts)) for change in changed]),
+    )
+
+
+def anywhere(task: Task, number: int) -> list[Y]:
     """Starts uniform within the bounds: also nearer to the reference and farther than usual."""
     low, high = task.bounds
-
-    def start(seed: int) -> jax.Array:
-        return jax.random.uniform(jax.random.key(seed), low.shape, low.dtype, low, high)
-
-    return dataclasses.replace(task, start=start)
+    uniform = lambda seed: jax.random.uniform(jax.random.key(seed), low.shape, low.dtype, low, high)
+    return [uniform(seed) for seed in range(number)]
 
 
-def _sampling(num: int) -> list[Method]:
+def sampling(num: int) -> list[Method]:
     """Ours with so many evaluations in a step, under the names of the usual ones."""
 
     def newton_cg(task: Task):
@@ -67,9 +102,8 @@ def _sampling(num: int) -> list[Method]:
         return run_by(sd.minimise, task, task.loss, solver)
 
     def gauss_newton(task: Task):
-        assert task.residuals is not None
         solver = sd.GaussNewton(task.sigma, num_samples=num)
-        return run_by(sd.least_squares, task, task.residuals, solver)
+        return run_by(sd.least_squares, task, residuals(task), solver)
 
     usual = (methods.load("newton_cg"), newton_cg), (methods.load("gauss_newton"), gauss_newton)
     return [
@@ -78,22 +112,12 @@ def _sampling(num: int) -> list[Method]:
     ]
 
 
-def _compressed(task: Task, level: int) -> Task:
-    """The task with what a JPEG of this level adds to the photograph."""
+def compressed(task: Task, level: int) -> Residuals:
+    """The task's residuals from the JPEG of this level, instead of the photograph."""
     assert task.image is not None
-    assert task.residuals is not None
-    residuals, exact = task.residuals, np.asarray(task.image(task.reference))
-    error, quality = _jpeg(exact, level / 100)
-
-    def with_error(y):
-        return residuals(y) - error
-
-    return dataclasses.replace(
-        task,
-        residuals=with_error,
-        loss=lambda y: jnp.mean(with_error(y) ** 2),
-        notes=f"{task.notes}, JPEG quality {quality}",
-    )
+    error, _ = _jpeg(np.asarray(task.image(task.reference)), level / 100)
+    exact = residuals(task)
+    return lambda y: exact(y) - error
 
 
 def _jpeg(linear: np.ndarray, level: float) -> tuple[np.ndarray, int | None]:
