@@ -19,7 +19,9 @@ from benchmarks.zerograds import (
     _loop,
     _setting,
     ablations,
+    control_variate,
     gradients,
+    replay,
     samples,
     toy,
 )
@@ -33,6 +35,10 @@ TINY = zerograds.Setting(
     gradients=("wicker",),
     gradient_seeds=1,
     truth=64,
+    replay=("wicker",),
+    replay_seeds=1,
+    control=("wicker",),
+    repeats=4,
 )
 
 
@@ -73,6 +79,8 @@ def test_runs_writes_and_resumes(monkeypatch, tmp_path, capsys):
     few = [each for each in _configurations.ablations() if each.name in ("ours", "no-smooth", "fd")]
     monkeypatch.setattr(_configurations, "ablations", lambda: few)
     monkeypatch.setattr(gradients, "TITLES", {"ours": "Ours"})
+    monkeypatch.setattr(control_variate, "BASELINES", {"mean": "the mean"})
+    monkeypatch.setattr(control_variate, "SHARES", (1.0,))
     zerograds.main(tmp_path, TINY, command="a test")
     assert "NoSmooth" in capsys.readouterr().out
     results = json.loads((tmp_path / "results.json").read_text())
@@ -97,7 +105,8 @@ def test_settings_name_tasks_that_are_there():
     groups = {name for members in _configurations.GROUPS.values() for name in members}
     for setting in (zerograds.QUICK, zerograds.FULL):
         assert set(setting.budgets) <= groups
-        assert set(setting.samples) | set(setting.gradients) <= set(setting.budgets)
+        named = {*setting.samples, *setting.gradients, *setting.replay, *setting.control}
+        assert named <= set(setting.budgets)
     assert set(zerograds.FULL.budgets) == groups
 
 
@@ -190,6 +199,22 @@ def test_samples_are_compared_at_the_end():
     found = samples.compare(runs, 40)
     assert found["samples"] == [2, 4]
     assert [each[1] for each in found["errors"]] == [0.1, 0.2]
+
+
+def test_replay_is_read_where_the_error_is_down_to_a_tenth():
+    runs = [run_of((1, 0.5, 0.1, 0.02)), run_of((1, 0.09, 0.05, 0.01)), run_of((1, 1, 1, 0.9))]
+    found = replay.compare(runs, np.array([10, 40]))
+    assert found["took"] == {"median": 20, "lower": 20, "upper": None}
+    assert found["final"]["median"] == 0.02
+    assert found["curves"][1] == pytest.approx([0.5, 0.02])
+
+
+def test_the_control_variate_is_what_the_run_has_learnt(slope):
+    # a gp knows a slope from its samples; without one, all variance is what the surrogate leaves
+    ratios = control_variate.along(slope, seed=0, repeats=20)
+    assert len(ratios["mean"]) == len(ratios["gp"]) == len(control_variate.SHARES)
+    assert ratios["mean"][-1] > 10
+    assert ratios["mean"][-1] > ratios["mean"][0]
 
 
 def test_signs_are_directions_of_unit_variance(key):

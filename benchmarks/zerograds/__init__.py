@@ -1,7 +1,8 @@
 """The report of ZeroGrads: what the paper shows of its method, on the programs that are here.
 
 `toy` is its Fig. 4, `ablations` its Table 2 and the supplement's Fig. 2, `gradients` its Fig. 11
-with what that leaves open, and `samples` the supplement's Fig. 3.
+with what that leaves open, and `samples` the supplement's Fig. 3. `replay` and `control_variate`
+are of what is ours.
 
 Source: ZeroGrads: Learning Local Surrogates for Non-Differentiable Graphics (Fischer and Ritschel).
 """
@@ -13,12 +14,19 @@ from typing import Any
 from rich.console import Console
 
 from benchmarks._summary import machine
-from benchmarks.zerograds import ablations, gradients, samples, toy
+from benchmarks.zerograds import ablations, control_variate, gradients, replay, samples, toy
 from benchmarks.zerograds._setting import FULL, QUICK, Setting
 
 __all__ = ["FULL", "PARTS", "QUICK", "Setting", "main"]
 
-PARTS = {"toy": toy, "ablations": ablations, "gradients": gradients, "samples": samples}
+PARTS = {
+    "toy": toy,
+    "ablations": ablations,
+    "gradients": gradients,
+    "samples": samples,
+    "replay": replay,
+    "control_variate": control_variate,
+}
 
 
 def main(folder: Path, setting: Setting, *, command: str, fresh: bool = False) -> None:

@@ -20,6 +20,10 @@ class Setting(NamedTuple):
         gradients: The tasks on which gradients are looked at.
         gradient_seeds: Starts there.
         truth: Samples of a true gradient.
+        replay: The tasks on which earlier batches are seen again, or not.
+        replay_seeds: Starts there.
+        control: The tasks on which the surrogate is a control variate; gradient_seeds starts.
+        repeats: Estimates of which a variance is taken.
     """
 
     name: str
@@ -29,6 +33,10 @@ class Setting(NamedTuple):
     gradients: tuple[str, ...]
     gradient_seeds: int
     truth: int
+    replay: tuple[str, ...]
+    replay_seeds: int
+    control: tuple[str, ...]
+    repeats: int
 
 
 QUICK = Setting(
@@ -46,6 +54,10 @@ QUICK = Setting(
     gradients=("rocket10", "led"),
     gradient_seeds=2,
     truth=4096,
+    replay=("rocket10", "wicker", "node-graph", "led"),
+    replay_seeds=5,
+    control=("rocket10", "led"),
+    repeats=100,
 )
 FULL = Setting(
     name="full",
@@ -65,6 +77,10 @@ FULL = Setting(
     gradients=("rocket10", "led", "mosaic", "mlp"),
     gradient_seeds=5,
     truth=32_768,
+    replay=("rocket10", "wicker", "node-graph", "brdf", "gravity", "led"),
+    replay_seeds=10,
+    control=("rocket10", "led"),
+    repeats=400,
 )
 
 
