@@ -196,6 +196,14 @@ def test_defaults_grow_with_the_parameters():
     assert (few, many, very_many) == (6, 50, 96)
 
 
+def test_later_steps_evaluate_less_once_samples_differ():
+    took = lambda fun: np.diff(
+        [0, *(r.evaluations for r in solve(fun, jnp.zeros(3), evaluations=40).history)]
+    )
+    assert took(line)[:4].tolist() == [7, 3, 3, 3]
+    assert took(lambda y, args: jnp.ones(5)).tolist() == [7, 7, 7]
+
+
 def test_a_schedule_is_taken_as_it_is():
     schedule = lambda step: 0.5 / (step + 1)
     solver = sd.GaussNewton(schedule)

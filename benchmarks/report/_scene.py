@@ -2,8 +2,8 @@
 
 Ours is one rule, and not what came out best: least squares where there are residuals, and a support
 where parameters act locally, as README advises. It was set before anything was run, and changed
-once, after results of cnn5, suzanne and mlp were seen: it named grey_ours and local_gradient before,
-and left gauss_newton out where there were more than 300 parameters.
+once, after results of cnn5, suzanne and mlp were seen: it named grey_ours and local_gradient, and
+left gauss_newton out where there were more than 300 parameters.
 """
 
 import json
