@@ -13,19 +13,17 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from stripes import SIDE, TITLE, build, halving
 
 from benchmarks import __main__ as cli
 from benchmarks import methods, tasks
 from benchmarks._summary import _of_method
-from benchmarks._task import Budget, NotAble, Task
+from benchmarks._task import NotAble
 from benchmarks.report import _atlas, _goals, _paper, _tables
 from benchmarks.report._scene import FEW, RULE, Scene
 
-TITLE = "A bowl"
-SIDE = 8  # pixels
 MACHINE = {"cpu": "a <CPU>", "cores": 2, "python": "3.11", "versions": {"jax": "1"}}
 
 
@@ -34,49 +32,6 @@ def standard_promotion():
     """optax's own Adam does not run under strict promotion."""
     with jax.numpy_dtype_promotion("standard"):
         yield
-
-
-def build(full):
-    """A picture with one stripe of each parameter's brightness."""
-    reference = jnp.asarray([0.25, 0.5])
-
-    def image(y):
-        return jnp.broadcast_to(jnp.repeat(y, SIDE // 2)[:, None, None], (SIDE, SIDE, 3))
-
-    def residuals(y):
-        return image(y) - image(reference)
-
-    def loss(y):
-        return jnp.sum(residuals(y) ** 2)  # exact, however it is compiled
-
-    return Task(
-        name="stripes",
-        title=TITLE,
-        loss=loss,
-        exact_loss=loss,
-        start=lambda seed: jnp.asarray([0.875, 0.125 + 0.0625 * (seed % 4)]),
-        reference=reference,
-        bounds=(jnp.zeros(2), jnp.ones(2)),
-        sigma=0.3,
-        budget=Budget(evaluations=60, seconds=60),
-        seeds=2,
-        image=image,
-        residuals=residuals,
-    )
-
-
-def halving(task):
-    """Halves the distance at each iteration, for one evaluation."""
-    loss = jax.jit(task.loss)
-
-    def solve(y0, key, record):
-        y = y0
-        for _ in range(8):
-            y = (y + task.reference) / 2
-            loss(y).block_until_ready()
-            record(y)
-
-    return solve
 
 
 def failing(task):

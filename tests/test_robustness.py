@@ -7,13 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from stripes import build, halving
 
 from benchmarks import methods, robustness, tasks
-from benchmarks._task import Budget, Task
 from benchmarks.robustness import _studies
-
-TITLE = "Stripes"
-SIDE = 8  # pixels
 
 
 @pytest.fixture(autouse=True)
@@ -21,46 +18,6 @@ def standard_promotion():
     """optax's own Adam does not run under strict promotion."""
     with jax.numpy_dtype_promotion("standard"):
         yield
-
-
-def build(full, spp=4):
-    """A picture with one stripe of each parameter's brightness."""
-    reference = jnp.asarray([0.25, 0.5])
-
-    def image(y):
-        return jnp.broadcast_to(jnp.repeat(y, SIDE // 2)[:, None, None], (SIDE, SIDE, 3))
-
-    def residuals(y):
-        return image(y) - image(reference)
-
-    return Task(
-        name="stripes",
-        title=TITLE,
-        loss=lambda y: jnp.mean(residuals(y) ** 2),
-        exact_loss=lambda y: jnp.mean(residuals(y) ** 2),
-        start=lambda seed: jnp.asarray([0.875, 0.125 + 0.0625 * seed]),
-        reference=reference,
-        bounds=(jnp.zeros(2), jnp.ones(2)),
-        sigma=0.3,
-        budget=Budget(evaluations=60, seconds=60),
-        seeds=2,
-        image=image,
-        residuals=residuals,
-    )
-
-
-def halving(task):
-    """Halves the distance at each iteration, for one evaluation."""
-    loss = jax.jit(task.loss)
-
-    def solve(y0, key, record):
-        y = y0
-        for _ in range(8):
-            y = (y + task.reference) / 2
-            loss(y).block_until_ready()
-            record(y)
-
-    return solve
 
 
 VARIANTS = {"halving": ("Halving", halving)}
