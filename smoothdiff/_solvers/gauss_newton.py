@@ -94,7 +94,7 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             most n, but at least 2, as the history has the others. For more than about 24
             parameters n / 2, at most 96.
         history: evaluations to keep, whose points and residuals are in memory. By default 12 n,
-            but at least 64 and at most 256, and never less than three steps; four steps for 100
+            but at least 32 and at most 256, and never less than three steps; four steps for 100
             parameters and more.
         sampler: where to sample. By default `Sobol`, for 100 parameters and more `Gaussian`, as
             few Sobol points in many dimensions make parameters look alike.
@@ -237,7 +237,7 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         n, dtype = params.theta.size, params.theta.dtype
         first, *_ = self._evaluations(y)
         if self.history is None:
-            length = max(min(max(12 * n, 64), 256), (3 if n < _MANY else 4) * first)
+            length = max(min(max(12 * n, 32), 256), (3 if n < _MANY else 4) * first)
         else:
             length = max(self.history, first)
         size = sum(leaf.size for leaf in leaves)
