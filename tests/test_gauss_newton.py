@@ -196,12 +196,26 @@ def test_defaults_grow_with_the_parameters():
     assert (few, many, very_many) == (6, 50, 96)
 
 
-def test_later_steps_evaluate_less_once_samples_differ():
-    took = lambda fun: np.diff(
-        [0, *(r.evaluations for r in solve(fun, jnp.zeros(3), evaluations=40).history)]
-    )
-    assert took(line)[:4].tolist() == [7, 3, 3, 3]
-    assert took(lambda y, args: jnp.ones(5)).tolist() == [7, 7, 7]
+@pytest.mark.parametrize(("parameters", "first", "later"), [(3, 7, 3), (120, 60, 60)])
+def test_what_is_reported_was_evaluated(parameters, first, later):
+    """Fewer once samples differ; and with many parameters those of the steps that are tried."""
+    seen = []
+
+    def bowl(y, args):
+        jax.debug.callback(lambda _: seen.append(0), y)
+        return y - 1
+
+    result = solve(bowl, jnp.zeros(parameters), evaluations=3 * first)
+    jax.effects_barrier()
+    assert len(seen) == result.evaluations
+    took = np.diff([0, *(record.evaluations for record in result.history)])
+    assert took[0] == first
+    assert set(took[1:].tolist()) <= {later}
+
+
+def test_a_plateau_is_looked_at_with_all_samples():
+    result = solve(lambda y, args: jnp.ones(5), jnp.zeros(3), evaluations=40)
+    assert [record.evaluations for record in result.history] == [7, 14, 21]
 
 
 def test_a_schedule_is_taken_as_it_is():

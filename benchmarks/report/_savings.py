@@ -9,7 +9,8 @@ from benchmarks.report._tables import amount
 from benchmarks.scenes._dearer import SAVINGS
 
 # of ours, by what they know of the loss
-FIRST, SECOND = ("first_order", "local_gradient"), ("newton_cg", "gauss_newton")
+FIRST = ("first_order", "local_gradient", "local_first_order")
+SECOND = ("newton_cg", "gauss_newton")
 
 
 def table(results: dict[str, Any], scenes: Sequence[Scene]) -> Grid:

@@ -20,6 +20,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from smoothdiff._solvers._base import dot
+
 # the damping of each step, in units of the largest squared singular value
 _DAMPINGS = tuple(10.0**-k for k in range(8))
 # lengths of the regression's step that are tried beside, and where it is alone
@@ -77,7 +79,7 @@ def local_steps(
     """
     slopes = _slopes(_centred(points, valid), _centred(residuals, valid), jnp.sum(valid))
     if low is not None and high is not None:
-        gradient = slopes @ here
+        gradient = dot(slopes, here)
         held = ((low >= 0) & (gradient > 0)) | ((high <= 0) & (gradient < 0))
         slopes = jnp.where(held[:, None], 0, slopes)
     return _damped(slopes, here)
@@ -98,10 +100,10 @@ def _slopes(u: Array, r: Array, count: Array) -> Array:
     chance = 2 * jnp.log(jnp.asarray(n, r.dtype) * size) / count.astype(r.dtype)
     slopes, left = jnp.zeros((n, size), r.dtype), r
     for _ in range(_ROUNDS):
-        more = u.T @ left / squares
+        more = dot(u.T, left) / squares
         kept = (slopes != 0) | (more**2 * squares > chance * jnp.sum(left**2, axis=0)[None])
         slopes = jnp.where(kept, slopes + more, 0)
-        left = r - u @ slopes
+        left = r - dot(u, slopes)
     return slopes
 
 
@@ -113,12 +115,12 @@ def _damped(slopes: Array, here: Array) -> Array:
         return x / jnp.where(length > 0, length, 1), length
 
     left, size = unit(here)
-    right, alpha = unit(slopes @ left)
+    right, alpha = unit(dot(slopes, left))
 
     def iterate(carry: tuple, _) -> tuple:
         left, right, alpha = carry
-        new_left, beta = unit(right @ slopes - alpha * left)
-        new_right, new_alpha = unit(slopes @ new_left - beta * right)
+        new_left, beta = unit(dot(right, slopes) - alpha * left)
+        new_right, new_alpha = unit(dot(slopes, new_left) - beta * right)
         return (new_left, new_right, new_alpha), (right, alpha, beta)
 
     _, (right, alpha, beta) = jax.lax.scan(iterate, (left, right, alpha), None, length=_KRYLOV)
@@ -128,4 +130,4 @@ def _damped(slopes: Array, here: Array) -> Array:
     u, s, vt = jnp.linalg.svd(lower, full_matrices=False)
     damping = s[0] ** 2 * jnp.asarray(_DAMPINGS, here.dtype)[:, None]
     gain = s[None] / jnp.where(s[0] > 0, s[None] ** 2 + damping, 1)
-    return -size * (gain * u[0][None]) @ vt @ right
+    return -size * dot(dot(gain * u[0][None], vt), right)

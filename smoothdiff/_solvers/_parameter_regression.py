@@ -16,6 +16,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from smoothdiff._solvers._base import dot
+
 # how far the linear model is trusted, in units of sigma
 _REACH = 3.0
 # how many ridges the marginal likelihood chooses among
@@ -26,10 +28,6 @@ _TIMES = 2
 _MISFIT = 0.01
 # ... and so much is enough: by then the metric is all but the identity
 _LARGE = 100.0
-
-
-def _dot(a: Array, b: Array) -> Array:
-    return jnp.matmul(a, b, precision="highest")
 
 
 def gauss_newton_step(
@@ -48,11 +46,11 @@ def gauss_newton_step(
     # far from the iterate the linear model is off by about the square of the distance
     distance = jnp.mean(u**2, axis=1) / _REACH**2
     weight = jnp.where(valid, 1 / (1 + distance**2), 0)
-    mean = _dot(weight, residuals) / jnp.sum(weight)
+    mean = dot(weight, residuals) / jnp.sum(weight)
     centred = (residuals - mean[None]) * jnp.sqrt(weight)[:, None]
     # the last row is the target, residuals of zero, seen from the mean
     rows = jnp.concatenate([centred, -mean[None]])
-    gram = _dot(rows, rows.T)
+    gram = dot(rows, rows.T)
     if low is None or high is None:
         return _regress(gram, u, weight)
     slope = _gradient(gram, u, weight)
@@ -82,12 +80,12 @@ def _regress(gram: Array, u: Array, weight: Array) -> tuple[Array, Array]:
     unit = 1 / jnp.where(spread > 0, spread, 1)
     inner, target, far = inner * unit, target * unit, far * unit
     root = jnp.sqrt(weight)
-    mean = _dot(weight, u) / jnp.sum(weight)
+    mean = dot(weight, u) / jnp.sum(weight)
     centred = (u - mean[None]) * root[:, None]
 
     eigenvalues, q = jnp.linalg.eigh(inner)
     eigenvalues = jnp.maximum(eigenvalues, 0)
-    square = _dot(q.T, centred) ** 2
+    square = dot(q.T, centred) ** 2
     floor = 8 * len(weight) * jnp.finfo(u.dtype).eps
     ridges = jnp.geomspace(floor, 1, _RIDGES, dtype=u.dtype)
     # the empty rows and the constant are in the null space: they are no data
@@ -112,18 +110,18 @@ def _regress(gram: Array, u: Array, weight: Array) -> tuple[Array, Array]:
     lowest = jnp.min(jnp.where(weight > 0, jnp.maximum(squares, 0), jnp.inf))
     misfit = jnp.minimum(_MISFIT * lowest / n, _LARGE) * count
     left, _, _ = _svd(centred)
-    unreached = _eye(inner) - _dot(left, left.T)
+    unreached = _eye(inner) - dot(left, left.T)
     # by eigenvalues, since rounding may leave the matrix indefinite
     eigenvalues, q = jnp.linalg.eigh(inner + misfit * unreached)
     eigenvalues = jnp.maximum(eigenvalues, 0) + ridge
-    along = _dot(q.T, target)
-    step = mean + _dot(_dot(q, along / eigenvalues), centred)
+    along = dot(q.T, target)
+    step = mean + dot(dot(q, along / eigenvalues), centred)
 
     # To a function that is all but linear, a target out of reach says nothing about the error.
     # The root is by experiment: the share itself gives up too early on plateaus.
     nonlinear = jnp.clip(jnp.sum(inner * unreached) / jnp.maximum(jnp.trace(inner), tiny), 0, 1)
     beyond = jnp.maximum(far - jnp.sum(along**2 / eigenvalues), 0) * jnp.sqrt(nonlinear)
-    scale = jnp.sum(_dot(q.T, centred) ** 2 / eigenvalues[:, None], axis=0) / count
+    scale = jnp.sum(dot(q.T, centred) ** 2 / eigenvalues[:, None], axis=0) / count
     return step, jnp.sqrt((beyond + ridge / count) * scale)
 
 
@@ -140,10 +138,10 @@ def _svd(u: Array) -> tuple[Array, Array, Array]:
         kept = s > eps * s[0]
     else:
         # of many parameters by the Gram matrix: several times as fast, at half of the digits
-        squares, left = jnp.linalg.eigh(_dot(u, u.T))
+        squares, left = jnp.linalg.eigh(dot(u, u.T))
         kept = squares > eps * squares[-1]
         s = jnp.sqrt(jnp.where(kept, squares, 1))
-        right = _dot(left.T, u) / s[:, None]
+        right = dot(left.T, u) / s[:, None]
     left = jnp.where(kept[None], left, 0)
     return left, jnp.where(kept, 1 / jnp.where(kept, s, 1), 0), right
 
@@ -151,25 +149,25 @@ def _svd(u: Array) -> tuple[Array, Array, Array]:
 def _gradient(gram: Array, u: Array, weight: Array) -> Array:
     """The slope of half the sum of squares at the iterate, by the linear fit."""
     root, total = jnp.sqrt(weight), jnp.sum(weight)
-    mean = _dot(weight, u) / total
+    mean = dot(weight, u) / total
     left, inverse, right = _svd((u - mean[None]) * root[:, None])
-    here = _dot(left, inverse * _dot(right, -mean))
-    along = _dot(gram[:-1, :-1], here) - gram[:-1, -1]
-    return _dot(inverse * _dot(left.T, along), right)
+    here = dot(left, inverse * dot(right, -mean))
+    along = dot(gram[:-1, :-1], here) - gram[:-1, -1]
+    return dot(inverse * dot(left.T, along), right)
 
 
 def _move(gram: Array, u: Array, weight: Array, held: Array, active: Array) -> Array:
     """The Gram matrix of the residuals as they would be with the active parameters held."""
     root, total = jnp.sqrt(weight), jnp.sum(weight)
-    centred = (u - (_dot(weight, u) / total)[None]) * root[:, None]
+    centred = (u - (dot(weight, u) / total)[None]) * root[:, None]
     away = jnp.where(active[None], u - held[None], 0) * root[:, None]
     left, inverse, right = _svd(centred)
     # the linear fit's change of each row, then each row from the new mean
-    moved = _eye(gram[1:, 1:]) - _dot(_dot(away, right.T) * inverse[None], left.T)
-    mean = _dot(root, moved) / total
+    moved = _eye(gram[1:, 1:]) - dot(dot(away, right.T) * inverse[None], left.T)
+    mean = dot(root, moved) / total
     moved = moved - root[:, None] * mean[None]
     last = jnp.zeros_like(weight)[:, None]
     rows = jnp.concatenate([moved, last], axis=1)
     target = jnp.concatenate([-mean, jnp.ones_like(mean[:1])])
     change = jnp.concatenate([rows, target[None]])
-    return _dot(_dot(change, gram), change.T)
+    return dot(dot(change, gram), change.T)

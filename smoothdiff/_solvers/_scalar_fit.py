@@ -18,16 +18,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from smoothdiff._solvers._base import dot
+
 # (share of curvatures, share of the rest): mostly the rest, mostly a quadratic, a quadratic
 _SHARES = ((0.1, 1.0), (1.0, 0.1), (1.0, 0.0))
 # the variance of the noise: the first is always safe to factorise, the last as small as may be
 _RIDGES = {"float32": (1.0, 1e-1, 1e-3, 1e-4), "float64": (1.0, 1e-1, 1e-3, 1e-6, 1e-8)}
 # points farther away than this, in widths, count less and less: the fit is a local one
 _REACH = 2.0
-
-
-def _dot(a: Array, b: Array) -> Array:
-    return jnp.matmul(a, b, precision="highest")
 
 
 class ScalarFit(eqx.Module):
@@ -43,7 +41,7 @@ class ScalarFit(eqx.Module):
     factor: Float[Array, "m m"]
 
     def _products(self, at: Array) -> Array:
-        return _dot(self.points, at) / at.size
+        return dot(self.points, at) / at.size
 
     def _bumps(self, at: Array) -> Array:
         n = at.size
@@ -58,14 +56,14 @@ class ScalarFit(eqx.Module):
 
     def value(self, at: Float[Array, " n"]) -> Float[Array, ""]:
         """The smoothed function."""
-        return self.constant + _dot(self.coefficients, self._value_features(at))
+        return self.constant + dot(self.coefficients, self._value_features(at))
 
     def grad(self, at: Float[Array, " n"]) -> Float[Array, " n"]:
         """Its gradient."""
         n = at.size
         bumps = self.coefficients * self._bumps(at) / (n + 1)
         slopes = self.coefficients * (1 + 2 * self.curved * self._products(at)) / n
-        return _dot(slopes + bumps, self.points) - jnp.sum(bumps) * at
+        return dot(slopes + bumps, self.points) - jnp.sum(bumps) * at
 
     def _bends(self, at: Array) -> tuple[Array, Array, Array]:
         n = at.size
@@ -77,8 +75,8 @@ class ScalarFit(eqx.Module):
         bends, bumps, away = self._bends(at)
 
         def product(v: Array) -> Array:
-            curved = _dot(bends * _dot(self.points, v), self.points)
-            rest = _dot(bumps / (v.size + 1) * _dot(away, v), away)
+            curved = dot(bends * dot(self.points, v), self.points)
+            rest = dot(bumps / (v.size + 1) * dot(away, v), away)
             return curved + rest - jnp.sum(bumps) * v
 
         return product
@@ -86,8 +84,8 @@ class ScalarFit(eqx.Module):
     def curvature_diagonal(self, at: Float[Array, " n"]) -> Float[Array, " n"]:
         """The diagonal of its Hessian."""
         bends, bumps, away = self._bends(at)
-        curved = _dot(bends, self.points**2)
-        return curved + _dot(bumps / (at.size + 1), away**2) - jnp.sum(bumps)[None]
+        curved = dot(bends, self.points**2)
+        return curved + dot(bumps / (at.size + 1), away**2) - jnp.sum(bumps)[None]
 
     # Standard errors: what the prior leaves open of a quantity, less what the samples tell of it.
 
@@ -138,7 +136,7 @@ class ScalarFit(eqx.Module):
         """The standard error of the gradient along a unit vector."""
         slopes, bumps = self._grad_features(at)
         along = jnp.vdot(at, v)
-        features = slopes * _dot(self.points, v) - bumps * along
+        features = slopes * dot(self.points, v) - bumps * along
         return self._stderr(features, self._grad_prior(at, along**2))
 
     def _grad_prior(self, at: Array, along: Array) -> Array:
@@ -149,7 +147,7 @@ class ScalarFit(eqx.Module):
     def curvature_stderr(self, at: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, ""]:
         """The standard error of v·Hv, for a unit vector."""
         n = at.size
-        along = _dot(self.points, v)
+        along = dot(self.points, v)
         away = along - jnp.vdot(at, v)
         bumps = self._bumps(at) / (n + 1)
         features = 2 * self.curved * along**2 / n**2 + bumps * (away**2 / (n + 1) - 1)
@@ -174,7 +172,7 @@ def fit(
     middle, scale = jnp.nanmedian(known), jnp.nanstd(known)
     scale = jnp.where(scale > 0, scale, 1)
     targets = jnp.where(valid, (values - middle) / scale, 0)
-    gram = _dot(points, points.T) / points.shape[1]
+    gram = dot(points, points.T) / points.shape[1]
     apart = spread[:, None] + spread[None] - 2 * gram
     radial = jnp.exp(-jnp.maximum(apart, 0) / 2)
     weights = closeness[:, None] * closeness[None]

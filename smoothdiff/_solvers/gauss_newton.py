@@ -67,15 +67,15 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     evaluations. $\Gamma$, the covariance of what it leaves, is the metric: pixels that jump at
     random have no say, and where all do, the step is damped as by Levenberg and Marquardt. Nothing
     larger than history x history is factorised, whatever the numbers of parameters and residuals.
-    A step is not checked by evaluations of its own; the next batch includes its end point, and
-    fits in what it finds.
+    With few parameters a step is not checked by evaluations of its own; the next batch includes its
+    end point, and fits in what it finds.
 
-    With 100 parameters and more, where a batch says little about each of so many, 12 evaluations of
-    a step go to the ends of 12 steps, and the best is taken if it is an improvement: the one above
-    at several lengths, and steps by a Jacobian of which only those entries are kept that cannot be
-    chance. That finds by itself which residuals a parameter moves, if these are few, from a number
-    of samples that grows with the logarithm of n. It takes n x P numbers for P residuals, and is
-    left out where that is more than 2e8.
+    With 100 parameters and more (and at least 36 evaluations a step), where a batch says little
+    about each of so many, 12 of the evaluations go to the ends of 12 steps, and the best is taken
+    if it is an improvement: the one above at several lengths, and steps by a Jacobian of which only
+    those entries are kept that cannot be chance. That finds by itself which residuals a parameter
+    moves, if these are few, from a number of samples that grows with the logarithm of n. It takes
+    n x P numbers for P residuals, and is left out where that is more than 2e8.
 
     What is sought is a small sum of squares, $\min_y \frac12 \sum_p r_p(y)^2$. Where it does not
     vanish the metric becomes the identity as sigma shrinks, so that the limit is the least-squares
@@ -91,8 +91,8 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             schedule, a function from the number of the step to a number, is taken as it is.
         num_samples: evaluations a step, the one at the iterate included. By default
             4 + 3 log(n) for n parameters at first and while all samples are the same, later at
-            most n, but at least 2, as the history has the others. For more than about 24
-            parameters n / 2, at most 96.
+            most n, but at least 2, as the history has the others (under `vmap` all are evaluated
+            all the same). For more than about 24 parameters n / 2, at most 96.
         history: evaluations to keep, whose points and residuals are in memory. By default 12 n,
             but at least 32 and at most 256, and never less than three steps; four steps for 100
             parameters and more.
@@ -100,7 +100,7 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             few Sobol points in many dimensions make parameters look alike.
         batch_size: evaluate at most so many samples at a time, as for `smooth`.
         nonfinite: "propagate" or "drop" samples with a NaN or an infinity in their residuals; as
-            long as half of a batch are finite.
+            long as half of a batch are finite. The end of a step that is tried may be anything.
         rtol: relative tolerance. The run has converged when three steps in a row and their sigma
             are below `atol + rtol * norm(y)`.
         atol: absolute tolerance. By default both are zero, and the run uses up its budget.
