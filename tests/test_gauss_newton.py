@@ -1,6 +1,7 @@
 """Gauss-Newton on residuals: known optima, bounds, plateaus, faults, optimistix's solvers."""
 
 import itertools
+from functools import partial
 from typing import Any
 
 import jax
@@ -233,6 +234,43 @@ def test_converges_by_tolerance():
     np.testing.assert_allclose(result.y, [2, 3, 0.5], atol=0.02)
 
 
+def places(y, target):
+    """A short and a long bar in one picture; where they have changed places, all ways lead up."""
+    pixels = jnp.asarray(np.arange(40), y.dtype)
+    bar = lambda y, size: (jnp.abs(pixels - y) <= size).astype(y.dtype)
+    draw = lambda y: bar(y[0], 1.5) + bar(y[1], 4.5)
+    return draw(y) - draw(target)
+
+
+def test_restarts_find_the_deepest_of_several_valleys():
+    y0, target, bounds = jnp.array([24.0, 16.0]), jnp.array([10.0, 29.0]), (0.0, 39.0)
+    once, often = sd.GaussNewton(5.0), sd.GaussNewton(5.0, restarts=20)
+    found = []
+    for key in jax.random.split(KEY, 6):
+        run = partial(sd.least_squares, places, y0, target, key=key, bounds=bounds)
+        one, all_of_them = run(solver=once, max_steps=60), run(solver=often, max_steps=600)
+        found.append([np.allclose(result.y, target, atol=1) for result in (one, all_of_them)])
+        # nothing is different until the first search leads nowhere
+        for a, b in zip(one.history[:30], all_of_them.history, strict=False):
+            np.testing.assert_array_equal(a.y, b.y)
+    by_one, by_all = np.sum(found, axis=0)
+    assert by_one < 4
+    assert by_all > 4
+
+
+def test_a_restart_begins_at_the_start_with_the_first_sigma():
+    solver = sd.GaussNewton(0.5, patience=3, restarts=2)
+    run = sd.least_squares(line, jnp.ones(3), key=KEY, solver=solver, max_steps=100)
+    begun = [i for i, r in enumerate(run.history) if np.array_equal(r.y, np.ones(3))]
+    assert len(begun) == 2
+    # the last search goes on, as the only one would
+    assert run.reason == "max_steps"
+    for i in begun:
+        assert run.history[i + 1].sigma == 0.5
+        assert not np.array_equal(run.history[i + 1].y, run.history[0].y)
+    np.testing.assert_allclose(run.y, np.linalg.lstsq(DESIGN, DATA)[0], atol=1e-2)
+
+
 def test_nan_during_a_step_keeps_what_was_found():
     broken = lambda y, args: jnp.where(y[0] > 0.7, jnp.nan, 1.0) * (y - 1)
     with pytest.raises(sd.MinimiseError, match="NaN or infinite") as caught:
@@ -254,12 +292,13 @@ def test_bad_samples_are_left_out():
     [
         lambda: sd.GaussNewton(0.1, num_samples=2),
         lambda: sd.GaussNewton(0.1, num_samples=8, history=4),
+        lambda: sd.GaussNewton(0.1, restarts=-1),
         lambda: solve(line, jnp.zeros(3), sigma=-1.0),
         lambda: solve(tree, {"a": jnp.ones(()), "b": jnp.ones(2)}, sigma={"a": 1.0, "b": None}),
     ],
 )
 def test_bad_settings_are_refused(make):
-    with pytest.raises(ValueError, match=r"num_samples|history|sigma"):
+    with pytest.raises(ValueError, match=r"num_samples|history|restarts|sigma"):
         make()
 
 

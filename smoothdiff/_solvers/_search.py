@@ -1,9 +1,8 @@
-"""One search of Newton-CG, from a start to where it leads nowhere, and starting another one."""
+"""One search of Newton-CG, from a start to where it leads nowhere."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._noisy_step import Trust
@@ -48,36 +47,3 @@ class Search(eqx.Module):
     def done(self, patience: int) -> Bool[Array, ""]:
         """Whether so many steps in a row led nowhere."""
         return self.trust.quiet >= patience
-
-
-class Restarts(eqx.Module):
-    """How many searches may still follow, where they begin, and what the best one saw.
-
-    Searches that have just begun are wide. So that they are not compared with the end of others on
-    that width, `metric` and `width` are those of the lowest estimate so far.
-    """
-
-    left: Int[Array, ""]
-    theta: Float[Array, " n"]
-    metric: Metric
-    width: Float[Array, ""]
-
-    def after(self, lowest: Bool[Array, ""], metric: Metric, width: Float[Array, ""]) -> "Restarts":
-        """Remembers how wide the batch was, if its estimate is the lowest so far."""
-        kernel = jax.tree.map(
-            lambda a, b: jnp.where(lowest, a, b), (metric, width), (self.metric, self.width)
-        )
-        return Restarts(self.left, self.theta, *kernel)
-
-    def next(
-        self, search: Search, metric: Metric, patience: int
-    ) -> tuple[Bool[Array, ""], Search, "Restarts"]:
-        """Whether the search is over and another one begins, the search that goes on, what is left.
-
-        `metric` is that of the first sigma.
-        """
-        again = search.done(patience) & (self.left > 0)
-        first = Search.start(self.theta, metric, len(search.valid))
-        search = jax.tree.map(lambda a, b: jnp.where(again, a, b), first, search)
-        left = self.left - again.astype(self.left.dtype)
-        return again, search, Restarts(left, self.theta, self.metric, self.width)

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from smoothdiff._draws import Draws
 from smoothdiff._params import Params, take_apart
 from smoothdiff._samplers import AbstractSampler, Gaussian, Sobol
 from smoothdiff._solvers._base import (
@@ -26,33 +25,25 @@ from smoothdiff._solvers._base import (
 )
 from smoothdiff._solvers._local_steps import TRIED, steps_to_try
 from smoothdiff._solvers._parameter_regression import gauss_newton_step
+from smoothdiff._solvers._residual_batch import ResidualBatch, Residuals, around
 from smoothdiff._solvers._residual_history import History
+from smoothdiff._solvers._residual_search import ResidualSearch
+from smoothdiff._solvers._restarts import Restarts
 
 # the longest step of any parameter, in units of its sigma: beyond it nothing has been seen
 _LONGEST = 2.0
-# sigma follows twice the standard error of the step, at most so much smaller or larger at a time
-_SHRINK, _GROW = 0.25, 1.5
-# ... and no wider than so many times what the user gave, unless all samples are the same
-_WIDEST = 2.0
 # evaluations a step of a problem with many parameters
 _MOST = 96
 # from so many parameters on, several steps are evaluated and the best is taken
 _MANY = 100
-# so many small steps in a row count as convergence
-_PATIENCE = 3
 
 
 class GaussNewtonState(eqx.Module):
-    """The state of `GaussNewton`: the width, and a history of points with their residuals.
-
-    `seen` says that the last samples were not all the same, `quiet` counts small steps in a row.
-    """
+    """The state of `GaussNewton`."""
 
     progress: Progress
-    scale: Float[Array, ""]
-    history: History
-    seen: Bool[Array, ""]
-    quiet: Int[Array, ""]
+    search: ResidualSearch
+    restarts: Restarts | None
 
 
 class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
@@ -105,10 +96,15 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             are below `atol + rtol * norm(y)`.
         atol: absolute tolerance. By default both are zero, and the run uses up its budget.
         norm: the norm of steps and iterates.
+        patience: with restarts, so many steps in a row without a lower estimate end a search, as
+            convergence does. The last search goes on.
+        restarts: how many searches may follow, each from the first point and with the first sigma,
+            but with other random numbers: for residuals with several minima, or with plateaus at
+            the start. The best point of all is returned.
 
     Raises:
-        ValueError: fewer than 3 evaluations a step, a history that holds less than a step, another
-            word for `nonfinite`; and, when it runs, a leaf without a sigma.
+        ValueError: fewer than 3 evaluations a step, a history that holds less than a step, negative
+            restarts, another word for `nonfinite`; and, when it runs, a leaf without a sigma.
         TypeError: residuals that are no real floating-point numbers.
 
     Example:
@@ -139,6 +135,8 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     rtol: float
     atol: float
     norm: Callable[[PyTree], Float[Array, ""]]
+    patience: int
+    restarts: int
 
     def __init__(
         self,
@@ -152,6 +150,8 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         rtol: float = 0.0,
         atol: float = 0.0,
         norm: Callable[[PyTree], Float[Array, ""]] = optx.max_norm,
+        patience: int = 30,
+        restarts: int = 0,
     ):
         if num_samples is not None and num_samples < 3:
             raise ValueError(f"num_samples={num_samples}: a step needs at least 3 evaluations")
@@ -161,6 +161,8 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             raise ValueError(
                 f"history={history} is less than num_samples={num_samples}: keep at least a batch"
             )
+        if restarts < 0:
+            raise ValueError(f"restarts must be 0 or more: {restarts}")
         self.sigma = sigma
         self.num_samples = num_samples
         self.history = history
@@ -170,6 +172,8 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         self.rtol = rtol
         self.atol = atol
         self.norm = norm
+        self.patience = patience
+        self.restarts = restarts
 
     def evaluations_per_step(self, y: PyTree[Array]) -> int:
         """One batch, as large as the first, and the steps that are tried."""
@@ -189,44 +193,39 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         tried = TRIED if n >= _MANY and first >= 3 * TRIED else 0
         return first - tried, later - tried, tried
 
-    def _best(self, fn, args, params: Params, sigma, steps, here) -> tuple[Array, Array]:
-        """The step that leads to the smallest sum of squares, if that is a smaller one."""
-        ends = jax.vmap(params.clip)(params.theta[None] + sigma[None] * steps)
-        found = jnp.sum(self._evaluate(fn, args, params, ends)[0] ** 2, axis=1)
-        found = jnp.where(jnp.isfinite(found), found, jnp.inf)
-        best = jnp.argmin(found)
-        move = jnp.where(found[best] < jnp.sum(here**2), steps[best], 0)
-        return move, jnp.max(jnp.abs(move))
-
     def _params(self, y: PyTree, step: Int[Array, ""], options: dict) -> Params:
         params = take_apart(y, sigma_at(self.sigma, step), read_options(options)[1])
         if params.free:
             raise ValueError("GaussNewton needs a sigma for every leaf of the parameters, not None")
         return params
 
-    def _evaluate(self, fn, args, params: Params, points: Array) -> tuple[Array, PyTree]:
-        """Residuals as rows, and aux of the first, at points of the parameters as rows."""
-
-        def row(x: Array) -> tuple[Array, PyTree]:
-            out, aux = fn(params.layout.tree(x), args)
-            leaves = [jnp.ravel(leaf).astype(x.dtype) for leaf in jax.tree.leaves(out)]
-            return jnp.concatenate(leaves), aux
-
-        rows, aux = jax.lax.map(row, points, batch_size=self.batch_size or len(points))
-        return rows, jax.tree.map(lambda a: a[0], aux)
-
-    def _sample(self, params: Params, key: Array, sigma: Array, count: int) -> Array:
-        """Points around the parameters, within the bounds."""
-        n = params.theta.size
+    def _points(self, params: Params, key: Array, sigma: Array, count: int) -> Array:
         # few Sobol points are all but the same in some pairs of very many dimensions
-        sampler = self.sampler or (Sobol() if n < _MANY else Gaussian())
-        draws = Draws(sampler, key, count, n, params.theta.dtype, None)
-        return draws.map(lambda z, _: jax.vmap(params.clip)(params.theta[None] + sigma[None] * z))
+        sampler = self.sampler or (Sobol() if params.theta.size < _MANY else Gaussian())
+        return around(params, sampler, key, sigma, count)
+
+    def _batch(
+        self, residuals: Residuals, key: Array, sigma: Array, y: PyTree, seen: Bool[Array, ""]
+    ) -> tuple[ResidualBatch, PyTree]:
+        """The iterate and samples around it, fewer of them once they differ; and aux."""
+        first, later, _ = self._evaluations(y)
+        params = residuals.params
+        points = jnp.concatenate([params.theta[None], self._points(params, key, sigma, first - 1)])
+
+        def evaluate(count: int) -> tuple[Array, PyTree]:
+            rows, aux = residuals(points[:count])
+            return jnp.pad(rows, ((0, first - count), (0, 0))), aux
+
+        if later == first:
+            count, (rows, aux) = jnp.asarray(first), evaluate(first)
+        else:
+            count = jnp.where(seen, later, first)
+            rows, aux = jax.lax.cond(seen, lambda: evaluate(later), lambda: evaluate(first))
+        return ResidualBatch.of(points, rows, count), aux
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> GaussNewtonState:
         """Checks what can be looked at; evaluates nothing."""
-        start = jnp.asarray(0, jnp.int32)
-        params = self._params(y, start, options)
+        params = self._params(y, jnp.asarray(0, jnp.int32), options)
         leaves = jax.tree.leaves(f_struct)
         for leaf in leaves:
             if not jnp.issubdtype(leaf.dtype, jnp.floating):
@@ -241,40 +240,21 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         else:
             length = max(self.history, first)
         size = sum(leaf.size for leaf in leaves)
-        return GaussNewtonState(
-            Progress.start(y, dtype),
-            jnp.asarray(1, dtype),
-            History.empty(length, n, size, dtype),
-            jnp.asarray(False),
-            start,
-        )
+        search = ResidualSearch.start(History.empty(length, n, size, dtype))
+        restarts = Restarts.start(self.restarts, params.theta, search.scale)
+        return GaussNewtonState(Progress.start(y, dtype), search, restarts)
 
     def step(self, fn, y, args, options, state, tags):
         """One batch, one regression, one step."""
-        progress = state.progress
+        progress, search = state.progress, state.search
         params = self._params(y, progress.step, options)
+        residuals = Residuals(fn, args, params, self.batch_size)
         key = jax.random.fold_in(read_options(options)[0], progress.step)
-        first, later, tried = self._evaluations(y)
-        sigma = params.sigma * state.scale
-        new = jnp.concatenate([params.theta[None], self._sample(params, key, sigma, first - 1)])
+        first, _, tried = self._evaluations(y)
+        sigma = params.sigma * search.scale
+        batch, aux = self._batch(residuals, key, sigma, y, search.seen)
+        history = search.history.after(batch.points, batch.rows, batch.good, batch.count)
 
-        def evaluate(count: int) -> tuple[Array, PyTree]:
-            rows, aux = self._evaluate(fn, args, params, new[:count])
-            return jnp.pad(rows, ((0, first - count), (0, 0))), aux
-
-        if later == first:
-            count, (batch, aux) = jnp.asarray(first), evaluate(first)
-        else:
-            count = jnp.where(state.seen, later, first)
-            batch, aux = jax.lax.cond(state.seen, lambda: evaluate(later), lambda: evaluate(first))
-        good = (jnp.arange(first) < count) & jnp.isfinite(batch).all(axis=1)
-        lost = count - jnp.sum(good)
-        enough = lost == 0 if self.nonfinite == "propagate" else 2 * lost <= count
-        batch = jnp.where(good[:, None], batch, 0)
-        history = state.history.after(new, batch, good, count)
-        residuals, valid = history.residuals, history.valid
-
-        fun, stderr = _mean(jnp.sum(batch**2, axis=1) / 2, good)
         u = (history.points - params.theta[None]) / sigma[None]
         sides = [
             None if side is None else (side - params.theta) / sigma
@@ -282,67 +262,74 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         ]
         # steps that are evaluated are so within the bounds
         known = (None, None) if tried else sides
-        move, error = gauss_newton_step(u, residuals, valid, *known)
+        move, error = gauss_newton_step(u, history.residuals, history.valid, *known)
         longest = jnp.max(jnp.abs(move))
         move = move / jnp.maximum(1, longest / _LONGEST)
         if tried:
-            steps = steps_to_try(move, u, residuals, valid, batch[0], first, *sides)
-            move, longest = self._best(fn, args, params, sigma, steps, batch[0])
+            here = batch.rows[0]
+            steps = steps_to_try(move, u, history.residuals, history.valid, here, first, *sides)
+            move, longest = _best(residuals, sigma, steps, here)
         theta = params.clip(params.theta + sigma * move)
-        same = jnp.all(jnp.where(good[:, None], batch == batch[jnp.argmax(good)][None], True))
-        scale = state.scale
+        same = batch.same()
+        scale = search.scale
         if not callable(self.sigma):
-            # a plateau of the residuals around the iterate is seen whole or not at all
-            plateau = valid & jnp.all(residuals == batch[:1], axis=1)
-            extent = jnp.max(jnp.where(plateau, jnp.sqrt(jnp.mean(u**2, axis=1)), 0))
-            wanted = jnp.maximum(2 * jnp.sqrt(jnp.mean(error**2)), longest / _LONGEST)
-            wanted = jnp.clip(jnp.maximum(wanted, extent), _SHRINK, _GROW)
             # a few that are the same call for more of them first
-            alone = same & (count == first)
-            scale = jnp.where(alone, 2 * scale, jnp.minimum(wanted * scale, _WIDEST))
+            flat = same & (batch.count == first)
+            scale = search.wanted(flat, history, batch.rows[0], u, error, longest / _LONGEST)
 
+        fun, stderr = batch.loss()
         new_y = params.layout.tree(theta)
         with promotion():
             moved = self.norm(params.layout.tree(jnp.abs(theta - params.theta) + sigma))
             small = moved < self.atol + self.rtol * self.norm(y)
-        quiet = jnp.where(small, state.quiet + 1, 0)
-        finite = enough & all_finite((fun, theta, scale))
-        progress = progress.after(y, fun, stderr, sigma, count + tried, finite)
-        after = GaussNewtonState(progress, scale, history, ~same, quiet)
-        before = eqx.tree_at(lambda s: s.progress, state, progress)
-        new_y, state = unless_failed(finite, (new_y, after), (y, before))
-        return new_y, state, aux
+        finite = batch.enough(self.nonfinite) & all_finite((fun, theta, scale))
+        after = search.after(scale, history, ~same, fun, small)
+        new_y, after = unless_failed(finite, (new_y, after), (y, search))
+        progress = progress.after(y, fun, stderr, sigma, batch.count + tried, finite)
+        restarts = state.restarts
+        if restarts is not None:
+            lowest = progress.best_fun < state.progress.best_fun
+            begun = ResidualSearch.start(jax.tree.map(jnp.zeros_like, history))
+            again, after, restarts = restarts.after(lowest, search.scale).next(
+                after.over(self.patience), after, begun
+            )
+            start = params.layout.tree(restarts.theta)
+            new_y = jax.tree.map(lambda a, b: jnp.where(again, a, b), start, new_y)
+        return new_y, GaussNewtonState(progress, after, restarts), aux
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """After small steps in a row, or a failed one."""
-        return stopped(state.progress, state.quiet >= _PATIENCE)
+        return stopped(state.progress, state.search.converged())
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         """Judges the last iterate and the best recorded on the next step's samples."""
         progress = state.progress
         key = jax.random.fold_in(read_options(options)[0], progress.step)
         count = self.evaluations_per_step(y)
+        # with restarts, on the width on which the lowest estimate was made
+        scale = state.search.scale if state.restarts is None else state.restarts.width
 
         def estimate(y):
             params = self._params(y, progress.step, options)
-            points = self._sample(params, key, params.sigma * state.scale, count)
-            residuals, _ = self._evaluate(fn, args, params, points)
-            good = jnp.isfinite(residuals).all(axis=1)
-            fun, stderr = _mean(
-                jnp.sum(jnp.where(good[:, None], residuals, 0) ** 2, axis=1) / 2, good
-            )
-            kept = jnp.all(good) if self.nonfinite == "propagate" else 2 * jnp.sum(good) >= count
-            return jnp.where(kept, fun, jnp.nan), stderr
+            points = self._points(params, key, params.sigma * scale, count)
+            rows, _ = Residuals(fn, args, params, self.batch_size)(points)
+            batch = ResidualBatch.of(points, rows, jnp.asarray(count))
+            fun, stderr = batch.loss()
+            return jnp.where(batch.enough(self.nonfinite), fun, jnp.nan), stderr
 
         y, fun, stderr = judge(estimate, y, progress.best_y)
         evaluations = progress.evaluations + self.final_evaluations(y)
         return y, aux, {"fun": fun, "stderr": stderr, "evaluations": evaluations}
 
 
-def _mean(values: Array, good: Array) -> tuple[Array, Array]:
-    """The mean of the good values, and its standard error."""
-    count = jnp.sum(good).astype(values.dtype)
-    mean = jnp.sum(jnp.where(good, values, 0)) / count
-    square = jnp.sum(jnp.where(good, (values - mean) ** 2, 0))
-    stderr = jnp.sqrt(square / jnp.maximum(count * (count - 1), 1))
-    return mean, jnp.where(count > 1, stderr, jnp.inf)
+def _best(
+    residuals: Residuals, sigma: Array, steps: Float[Array, "k n"], here: Float[Array, " P"]
+) -> tuple[Array, Array]:
+    """The step that leads to the smallest sum of squares, if that is a smaller one; its length."""
+    params = residuals.params
+    ends = jax.vmap(params.clip)(params.theta[None] + sigma[None] * steps)
+    found = jnp.sum(residuals(ends)[0] ** 2, axis=1)
+    found = jnp.where(jnp.isfinite(found), found, jnp.inf)
+    best = jnp.argmin(found)
+    move = jnp.where(found[best] < jnp.sum(here**2), steps[best], 0)
+    return move, jnp.max(jnp.abs(move))

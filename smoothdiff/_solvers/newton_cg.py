@@ -28,8 +28,9 @@ from smoothdiff._solvers._base import (
 )
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._noisy_step import outcome, propose, revise
+from smoothdiff._solvers._restarts import Restarts
 from smoothdiff._solvers._scalar_fit import ScalarFit, fit
-from smoothdiff._solvers._search import Restarts, Search
+from smoothdiff._solvers._search import Search
 from smoothdiff._stderr import value_stderr
 
 # the most entries of the points that are kept by default, 128 MB in float64
@@ -210,10 +211,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         params = self._params(y, step, options)
         theta, metric = params.theta, Metric.of(params.sigma, self._adaptive)
         search = Search.start(theta, metric, self._kept(y, theta.size))
-        restarts = None
-        if self.restarts:
-            left = jnp.asarray(self.restarts, jnp.int32)
-            restarts = Restarts(left, theta, metric, search.trust.width)
+        restarts = Restarts.start(self.restarts, theta, (metric, search.trust.width))
         return NewtonCGState(Progress.start(y, f_struct.dtype), search, restarts)
 
     def step(self, fn, y, args, options, state, tags):
@@ -272,9 +270,11 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         restarts = state.restarts
         if restarts is not None:
             lowest = progress.best_fun < state.progress.best_fun
-            restarts = restarts.after(lowest, metric, trust.width)
-            first = Metric.of(params.sigma, self._adaptive)
-            again, new_search, restarts = restarts.next(new_search, first, self.patience)
+            restarts = restarts.after(lowest, (metric, trust.width))
+            begun = Metric.of(params.sigma, self._adaptive)
+            first = Search.start(restarts.theta, begun, len(new_search.valid))
+            over = new_search.done(self.patience)
+            again, new_search, restarts = restarts.next(over, new_search, first)
             new_y = jax.tree.map(
                 lambda a, b: jnp.where(again, a, b), params.layout.tree(restarts.theta), new_y
             )
@@ -294,8 +294,8 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         """Judges the last point, the last accepted and the best recorded on fresh samples."""
         progress, search = state.progress, state.search
         # with restarts, on the width on which the lowest estimate was made
-        wide = search.trust.width if state.restarts is None else state.restarts.width
-        turned = search.metric if state.restarts is None else state.restarts.metric
+        kernel = search.metric, search.trust.width
+        turned, wide = kernel if state.restarts is None else state.restarts.width
 
         def estimate(y):
             params = self._params(y, progress.step, options)

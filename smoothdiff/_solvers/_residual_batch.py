@@ -1,0 +1,75 @@
+"""Residuals at points around an iterate: where they are taken, what came, what counts."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from smoothdiff._draws import Draws
+from smoothdiff._params import Params
+from smoothdiff._samplers import AbstractSampler
+
+
+class Residuals(eqx.Module):
+    """The function with its arguments, as rows of residuals at rows of parameters."""
+
+    fn: Callable[[PyTree, Any], tuple[PyTree, PyTree]]
+    args: PyTree
+    params: Params
+    batch_size: int | None = eqx.field(static=True)
+
+    def __call__(self, points: Float[Array, "m n"]) -> tuple[Float[Array, "m P"], PyTree]:
+        """Also the aux of the first."""
+
+        def row(x: Array) -> tuple[Array, PyTree]:
+            out, aux = self.fn(self.params.layout.tree(x), self.args)
+            leaves = [jnp.ravel(leaf).astype(x.dtype) for leaf in jax.tree.leaves(out)]
+            return jnp.concatenate(leaves), aux
+
+        rows, aux = jax.lax.map(row, points, batch_size=self.batch_size or len(points))
+        return rows, jax.tree.map(lambda a: a[0], aux)
+
+
+class ResidualBatch(eqx.Module):
+    """The first `count` of these rows were evaluated; the `good` ones of them are finite."""
+
+    points: Float[Array, "m n"]
+    rows: Float[Array, "m P"]
+    good: Bool[Array, " m"]
+    count: Int[Array, ""]
+
+    @staticmethod
+    def of(points: Array, rows: Array, count: Int[Array, ""]) -> "ResidualBatch":
+        """Rows that are not finite become zeros."""
+        good = (jnp.arange(len(rows)) < count) & jnp.isfinite(rows).all(axis=1)
+        return ResidualBatch(points, jnp.where(good[:, None], rows, 0), good, count)
+
+    def enough(self, nonfinite: str) -> Bool[Array, ""]:
+        """Whether all are good; half of them will do if the others may be dropped."""
+        lost = self.count - jnp.sum(self.good)
+        return lost == 0 if nonfinite == "propagate" else 2 * lost <= self.count
+
+    def same(self) -> Bool[Array, ""]:
+        """Whether there is no difference between the residuals of the good ones."""
+        first = self.rows[jnp.argmax(self.good)]
+        return jnp.all(jnp.where(self.good[:, None], self.rows == first[None], True))
+
+    def loss(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """The mean of half the sum of squares over the good ones, and its standard error."""
+        values, count = jnp.sum(self.rows**2, axis=1) / 2, jnp.sum(self.good)
+        count = count.astype(values.dtype)
+        mean = jnp.sum(values) / count
+        square = jnp.sum(jnp.where(self.good, (values - mean) ** 2, 0))
+        stderr = jnp.sqrt(square / jnp.maximum(count * (count - 1), 1))
+        return mean, jnp.where(count > 1, stderr, jnp.inf)
+
+
+def around(
+    params: Params, sampler: AbstractSampler, key: Array, sigma: Float[Array, " n"], count: int
+) -> Float[Array, "count n"]:
+    """Points around the parameters, within the bounds."""
+    draws = Draws(sampler, key, count, params.theta.size, params.theta.dtype, None)
+    return draws.map(lambda z, _: jax.vmap(params.clip)(params.theta[None] + sigma[None] * z))
