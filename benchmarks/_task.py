@@ -40,15 +40,17 @@ class Grey(NamedTuple):
         black: The loss of a case, (array, case) -> number. Each call is counted.
         cases: Their numbers.
         sigma: The scale of what is between the two.
-        residuals: (array, case) -> array, such that the loss of a case is the sum or the mean of
-            its squares, or None. A call is counted like a call of the loss.
+        render: array -> picture, such that the loss of a case is the mean squared difference to its
+            picture, or None. A call is counted like a call of the loss.
+        pictures: What a render is compared with, in the order of the cases' numbers.
     """
 
     white: Callable[[Y, jax.Array], jax.Array]
     black: Callable[[jax.Array, jax.Array], jax.Array]
     cases: jax.Array
     sigma: float
-    residuals: Callable[[jax.Array, jax.Array], jax.Array] | None = None
+    render: Callable[[jax.Array], jax.Array] | None = None
+    pictures: jax.Array | None = None
 
     def loss(self, y: Y) -> jax.Array:
         """The mean over all cases."""

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from smoothdiff._host_calls import HostFunction, Samples
+from smoothdiff._host_calls import HostFunction, Samples, wait_for
 
 
 def black_box(
@@ -152,6 +152,7 @@ class _Callback:
 
     def __call__(self, *leaves: Any) -> list[np.ndarray]:
         try:
+            wait_for(leaves)
             samples = Samples(leaves, self.ndims, self.tree)
             outs = [np.empty((len(samples), *out.shape), out.dtype) for out in self.shapes]
             self.host(samples, outs)

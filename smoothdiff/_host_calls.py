@@ -8,6 +8,7 @@ import concurrent.futures
 import dataclasses
 import logging
 import math
+import time
 import traceback
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -24,6 +25,26 @@ class BlackBoxError(RuntimeError):
     `MinimiseError`. Out of a `jax.jit` of your own comes an error of JAX's, which has the same
     message in its text.
     """
+
+
+def wait_for(leaves: Sequence[Any], seconds: float = 60.0) -> None:
+    """Waits until JAX has handed over the arguments; raises where it never will.
+
+    Args:
+        leaves: What a callback was given. JAX copies arrays of more than 100 kB by a thread of its
+            pool. Where that has one thread, the thread is busy with the callback, and
+            `numpy.asarray` would wait forever (jax-ml/jax #25861).
+        seconds: How long to wait at most.
+    """
+    end = time.monotonic() + seconds
+    while not all(getattr(leaf, "is_ready", lambda: True)() for leaf in leaves):
+        if time.monotonic() > end:
+            raise BlackBoxError(
+                f"JAX did not hand over the arguments within {seconds:g} s. Where a process has "
+                "one core, JAX has one thread, which cannot copy large arguments while it waits "
+                "for a host function: set the environment variable NPROC=2 before Python starts"
+            )
+        time.sleep(1e-4)
 
 
 class Samples:

@@ -159,16 +159,13 @@ def linear_grey(sigma: float = 0.5) -> Task:
     weights = jnp.array([[1.0, -2.0, 0.5, 0.3], [0.2, 0.4, -1.0, 0.1]])
     answers = inputs @ weights.T
 
-    def residuals(x, case):
-        return x - answers[case]
-
     def black(x, case):
-        return jnp.sum(residuals(x, case) ** 2)
+        return jnp.mean((x - answers[case]) ** 2)
 
     def white(y, case):
         return y.reshape(2, 4) @ inputs[case]
 
-    grey = Grey(white, black, jnp.arange(16), sigma, residuals)
+    grey = Grey(white, black, jnp.arange(16), sigma, lambda x: x, answers)
     reference = weights.ravel()
     return Task(
         name="linear",
@@ -239,12 +236,12 @@ def test_gauss_newton_finds_what_a_network_is_to_answer(monkeypatch, standard_pr
     assert task.loss(found[-1]) < 1e-4 * task.loss(task.start(0))
 
 
-@pytest.mark.parametrize("missing", ["grey", "residuals"])
-def test_gauss_newton_needs_residuals_behind_a_network(missing):
+@pytest.mark.parametrize("missing", ["grey", "render"])
+def test_gauss_newton_needs_pictures_behind_a_network(missing):
     task = linear_grey()
     assert task.grey is not None
-    grey = None if missing == "grey" else task.grey._replace(residuals=None)
-    with pytest.raises(NotAble, match="residuals"):
+    grey = None if missing == "grey" else task.grey._replace(render=None)
+    with pytest.raises(NotAble, match="pictures"):
         grey_gauss_newton.prepare(dataclasses.replace(task, grey=grey))
 
 

@@ -1,8 +1,10 @@
 """Grey boxes: what the black box is to be given, by Gauss-Newton, and a network that learns it.
 
-Each case has a solver of its own, which takes a step when it is the case's turn. It goes on where
-it was, or at the network's answer where that is better, so cases help one another. The network is
-trained by AD to answer what the solvers have found, which costs no evaluations.
+Each case has a solver of its own, which takes a step when it is the case's turn, from the best of
+three: where it was, the network's answer, and what came nearest of all renders so far, whichever
+case they were made for. So cases help one another, and no case stays in a valley that others have
+shown to be a wrong one. The network is trained by AD to answer what is known to be best, which
+costs no evaluations.
 
 Splitting a network where AD ends is the method of auxiliary coordinates (Carreira-Perpinan and
 Wang, Distributed optimization of deeply nested systems, 2014).
@@ -10,6 +12,7 @@ Wang, Distributed optimization of deeply nested systems, 2014).
 
 import itertools
 from functools import partial
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -26,68 +29,95 @@ DOUBT = 0.2  # in units of sigma: an error beyond it may be the solver's
 RATE, DECAY = 1e-3, 0.02  # of Adam, and what is left of it at the end
 
 
+class Known(NamedTuple):
+    """Of each case the best that was rendered, with its loss; and where its solver stands."""
+
+    best: jax.Array
+    loss: jax.Array
+    at: jax.Array
+    states: Any
+
+
 def prepare(task: Task) -> Solve:
     """Compiles steps of the solvers and lessons of the network."""
     grey = task.grey
-    if grey is None or grey.residuals is None:
-        raise NotAble("this task has no part that AD knows, or no residuals behind it")
-    residuals, count = grey.residuals, len(grey.cases)
+    if grey is None or grey.render is None or grey.pictures is None:
+        raise NotAble("this task has no part that AD knows, or no pictures behind it")
+    render, sought = grey.render, grey.pictures[grey.cases]
+    count = len(sought)
     answer = jnp.zeros_like(jax.eval_shape(grey.white, task.reference, grey.cases[0]))
-    shape = jax.eval_shape(residuals, answer, grey.cases[0])
     samples = sd.GaussNewton(grey.sigma).evaluations_per_step(answer)
     solver = sd.GaussNewton(grey.sigma, num_samples=samples, history=2 * samples)
-    function = lambda x, case: (residuals(x, case), None)
+    function = lambda x, picture: (render(x) - picture, None)
     drawn = min(CASES, count)
     rounds = task.budget.evaluations // (drawn * (samples + 2))
     optim = optax.adam(optax.linear_schedule(RATE, DECAY * RATE, rounds * LESSONS))
     answers = jax.jit(lambda y: jax.vmap(partial(grey.white, y))(grey.cases))
 
-    def step(key, said, found, state, case):
-        """One step of one solver."""
-        ahead = grey.black(said, case) < grey.black(found, case)
-        jump = jnp.sqrt(jnp.mean((said - found) ** 2)) / grey.sigma
-        scale = jnp.clip(jnp.where(ahead, jump, 0), state.scale, jnp.maximum(state.scale, 1))
-        state = eqx.tree_at(lambda state: state.scale, state, scale)
-        start = jnp.where(ahead, said, found)
-        options = {"key": key}
-        found, state, _ = solver.step(function, start, case, options, state, frozenset())
-        return found, state
+    def step(key, said, best, loss, at, state, picture):
+        """One step of one solver, and what was rendered for it."""
+        tried = jnp.stack([at, said])
+        shown = jax.vmap(render)(tried)
+        losses = jnp.append(_loss(shown, picture[None]), loss)
+        start = jnp.append(tried, best[None], axis=0)[jnp.argmin(losses)]
+        jump = jnp.sqrt(jnp.mean((start - at) ** 2)) / grey.sigma
+        scale = state.search.scale
+        scale = jnp.clip(jump, scale, jnp.maximum(scale, 1))
+        state = eqx.tree_at(lambda state: state.search.scale, state, scale)
+        at, state, _ = solver.step(function, start, picture, {"key": key}, state, frozenset())
+        points = state.search.history.points[-samples:]
+        seen = state.search.history.residuals[-samples:].reshape(samples, *picture.shape)
+        rendered = jnp.concatenate([tried, points]), jnp.concatenate([shown, seen + picture[None]])
+        return at, state, rendered
 
     @jax.jit
-    def solve_some(key, y, found, states, chosen):
-        """Steps of the solvers of some cases."""
+    def solve_some(key, y, known, chosen):
+        """Steps of the solvers of some cases, from whose renders all cases learn."""
         keys = jax.random.split(key, drawn)
-        cases = grey.cases[chosen]
-        said = jax.vmap(partial(grey.white, y))(cases)
-        some = jax.tree.map(lambda leaf: leaf[chosen], states)
-        new, some = jax.vmap(step)(keys, said, found[chosen], some, cases)
-        states = jax.tree.map(lambda leaf, part: leaf.at[chosen].set(part), states, some)
-        return found.at[chosen].set(new), states
+        said = jax.vmap(partial(grey.white, y))(grey.cases[chosen])
+        best, loss, at, states = jax.tree.map(lambda leaf: leaf[chosen], known)
+        at, states, (points, shown) = jax.vmap(step)(
+            keys, said, best, loss, at, states, sought[chosen]
+        )
+        points, shown = (a.reshape(-1, *a.shape[2:]) for a in (points, shown))
+        losses = jax.lax.map(lambda picture: _loss(shown, picture[None]), sought)
+        nearest = jnp.argmin(losses, axis=1)
+        loss = jnp.min(losses, axis=1)
+        better = loss < known.loss
+        return Known(
+            jnp.where(better[:, None], points[nearest], known.best),
+            jnp.where(better, loss, known.loss),
+            known.at.at[chosen].set(at),
+            jax.tree.map(lambda leaf, part: leaf.at[chosen].set(part), known.states, states),
+        )
 
     @jax.jit
-    def learn(key, y, state, found, known):
+    def learn(key, y, state, best):
         """One lesson on cases that have been drawn."""
-        chosen = jax.random.choice(key, count, (BATCH,), p=known / jnp.sum(known))
+        chosen = jax.random.choice(key, count, (BATCH,))
 
         def loss(y):
             said = jax.vmap(partial(grey.white, y))(grey.cases[chosen])
-            return jnp.mean(optax.huber_loss(said, found[chosen], delta=DOUBT * grey.sigma))
+            return jnp.mean(optax.huber_loss(said, best[chosen], delta=DOUBT * grey.sigma))
 
         updates, state = optim.update(jax.grad(loss)(y), state, y)
         return optax.apply_updates(y, updates), state
 
     def solve(y0, key, record):
         y, state = y0, optim.init(y0)
-        found, known = answers(y), jnp.zeros(count)
+        said, shape = answers(y), jax.eval_shape(render, answer)
         begin = lambda x: solver.init(function, x, None, {"key": key}, shape, None, frozenset())
-        states = jax.vmap(begin)(found)
+        known = Known(said, jnp.full(count, jnp.inf), said, jax.vmap(begin)(said))
         for i in itertools.count():
             now = jax.random.fold_in(key, i)
             chosen = jnp.arange(i * drawn, (i + 1) * drawn) % count
-            found, states = solve_some(now, y, found, states, chosen)
-            known = known.at[chosen].set(1)
+            known = solve_some(now, y, known, chosen)
             for lesson in jax.random.split(now, LESSONS):
-                y, state = learn(lesson, y, state, found, known)
+                y, state = learn(lesson, y, state, known.best)
             record(y)
 
     return solve
+
+
+def _loss(shown: jax.Array, picture: jax.Array) -> jax.Array:
+    return jnp.mean((shown - picture) ** 2, axis=tuple(range(1, shown.ndim)))

@@ -125,11 +125,8 @@ def network_task(
     def white(y: Float[Array, "weights"], case: Array) -> Float[Array, "outputs"]:
         return eqx.combine(unravel(y), rest)(inputs[case])
 
-    def residuals(pose: Float[Array, "outputs"], case: Array) -> Float[Array, "size size 3"]:
-        return render(pose) - pictures[case]
-
     def black(pose: Float[Array, "outputs"], case: Array) -> Float[Array, ""]:
-        return jnp.mean(residuals(pose, case) ** 2)
+        return jnp.mean((render(pose) - pictures[case]) ** 2)
 
     def exact_loss(y: Float[Array, "weights"]) -> Float[Array, ""]:
         seen = jax.vmap(lambda case: cleaner(white(y, case)))(unseen)
@@ -144,7 +141,7 @@ def network_task(
     def image(y: Float[Array, "weights"]) -> Float[Array, "size width 3"]:
         return jnp.concatenate([render(white(y, case)) for case in unseen[:SHOWN]], axis=1)
 
-    grey = Grey(white, black, jnp.arange(cases), sigma, residuals)
+    grey = Grey(white, black, jnp.arange(cases), sigma, render, pictures)
     reference = flat(solved(initial(2**31), inputs, poses, held_out))
     return Task(
         name=name,
