@@ -192,9 +192,7 @@ def _watched(task: Task, counter: Counter) -> Task:
         if (fun := getattr(task, name)) is not None:
             watched[name] = counter.watch(fun)
     if (grey := task.grey) is not None:
-        parts = {"black": grey.black, "render": grey.render}
-        seen = {name: counter.watch(part) for name, part in parts.items() if part is not None}
-        watched["grey"] = grey._replace(**seen)
+        watched["grey"] = grey._replace(render=counter.watch(grey.render))
         watched["loss"] = watched["grey"].loss
     if (native_ad := task.native_ad) is not None:
         watched["native_ad"] = lambda: counter.watch_native_ad(native_ad())

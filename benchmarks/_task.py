@@ -32,25 +32,23 @@ class Budget(NamedTuple):
 
 
 class Grey(NamedTuple):
-    """A loss in two parts, the mean over cases: what AD knows, and a black box behind it.
+    """A loss in two parts: what AD knows, such as a network, and behind it a renderer.
 
     Args:
-        white: What the black box is given in a case, (y, case) -> array; say, a network's answer to
-            a picture. JAX differentiates it.
-        black: The loss of a case, (array, case) -> number. Each call is counted.
-        cases: Their numbers.
+        white: What is to be rendered for a picture, (y, picture) -> array. JAX differentiates it.
+        render: array -> picture. Each call is counted.
+        cases: Pictures. The loss of one is the mean squared difference to what is rendered for it.
         sigma: The scale of what is between the two.
-        render: array -> picture, such that the loss of a case is the mean squared difference to its
-            picture, or None. A call is counted like a call of the loss.
-        pictures: What a render is compared with, in the order of the cases' numbers.
     """
 
     white: Callable[[Y, jax.Array], jax.Array]
-    black: Callable[[jax.Array, jax.Array], jax.Array]
+    render: Callable[[jax.Array], jax.Array]
     cases: jax.Array
     sigma: float
-    render: Callable[[jax.Array], jax.Array] | None = None
-    pictures: jax.Array | None = None
+
+    def black(self, x: jax.Array, case: jax.Array) -> jax.Array:
+        """The loss of a case of which the white part says x."""
+        return jnp.mean((self.render(x) - case) ** 2)
 
     def loss(self, y: Y) -> jax.Array:
         """The mean over all cases."""

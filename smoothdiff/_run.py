@@ -109,7 +109,9 @@ class Problem(eqx.Module):
         return jax.tree.map(lambda a: jnp.asarray(a, a.dtype), state)
 
     @eqx.filter_jit
-    def step(self, y: PyTree, state: Any) -> tuple[PyTree, Any]:
+    def step(self, y: PyTree, state: Any) -> tuple[PyTree, Any, Bool[Array, ""]]:
+        """The next iterate and state, and whether the solver wants to stop there."""
+
         # a loop of one step, since XLA rounds the body of a loop otherwise than the bare step: this
         # gives optimistix's iterates to the last bit
         def body(carry: tuple[PyTree, Any]) -> tuple[PyTree, Any]:
@@ -119,11 +121,13 @@ class Problem(eqx.Module):
             return y, state
 
         before = state.progress.step
-        return jax.lax.while_loop(lambda c: c[1].progress.step == before, body, (y, state))
+        y, state = jax.lax.while_loop(lambda c: c[1].progress.step == before, body, (y, state))
+        return y, state, self._done(y, state)
 
-    @eqx.filter_jit
-    def done(self, y: PyTree, state: Any) -> Bool[Array, ""]:
+    def _done(self, y: PyTree, state: Any) -> Bool[Array, ""]:
         return self.solver.terminate(self._fn, y, self.args, self.options, state, frozenset())[0]
+
+    done = eqx.filter_jit(_done)
 
     @eqx.filter_jit
     def judge(self, y: PyTree, state: Any) -> tuple[PyTree, dict[str, Any]]:
@@ -145,6 +149,7 @@ class Run:
     start: float = dataclasses.field(default_factory=time.monotonic)
     file: Checkpoint | None = None
     save_due: float = 0.0
+    stopped: Bool[Array, ""] | None = None
 
     @property
     def steps(self) -> int:
@@ -183,13 +188,14 @@ class Run:
 
     def done(self) -> str | None:
         """Why the solver wants to stop, if it does."""
-        done = self.problem.done(self.y, self.state)
-        return self.problem.solver.reason(self.state) if done else None
+        if self.stopped is None:
+            self.stopped = self.problem.done(self.y, self.state)
+        return self.problem.solver.reason(self.state) if self.stopped else None
 
     def step(self) -> Record:
         """Takes a step and keeps it, unless it failed."""
         with reraise():
-            y, state = jax.block_until_ready(self.problem.step(self.y, self.state))
+            y, state, stopped = jax.block_until_ready(self.problem.step(self.y, self.state))
         progress = state.progress
         if not progress.finite:
             raise MinimiseError(_NONFINITE, self.found("nonfinite", progress))
@@ -204,7 +210,7 @@ class Run:
         )
         # Ctrl-C may come between any two lines: the state has the last word on what was done
         self.history.append(record)
-        self.y, self.state = y, state
+        self.y, self.state, self.stopped = y, state, stopped
         if time.monotonic() >= self.save_due:
             self.save()
         return record

@@ -5,6 +5,8 @@ import logging
 import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 
@@ -14,7 +16,7 @@ import numpy as np
 import pytest
 
 from smoothdiff._black_box import black_box, reraise
-from smoothdiff._host_calls import BlackBoxError
+from smoothdiff._host_calls import BlackBoxError, wait_for
 
 SCALAR = jax.ShapeDtypeStruct((), jnp.float32)
 
@@ -701,3 +703,38 @@ def test_typed_keys_are_refused(key):
     with pytest.raises(TypeError, match=r"jax\.random\.key_data"):
         jax.jit(black_box(lambda k: 0.0, 0.0))(key)
     assert black_box(lambda k: float(k.sum()), 0.0)(jax.random.key_data(jax.random.key(3))) == 3
+
+
+class Slow:
+    """An argument that JAX has not copied yet."""
+
+    def __init__(self, looks):
+        self.looks = looks
+
+    def is_ready(self):
+        self.looks -= 1
+        return self.looks < 0
+
+
+def test_arguments_that_never_arrive_raise_instead_of_hanging():
+    wait_for([np.ones(3), Slow(3)], seconds=60.0)
+    with pytest.raises(BlackBoxError, match="NPROC=2"):
+        wait_for([np.ones(3), Slow(10**9)], seconds=0.05)
+
+
+def test_large_arguments_arrive_where_jax_has_two_threads():
+    """JAX reads NPROC as it starts, so this needs a process of its own."""
+    script = """
+import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+import numpy as np, jax, jax.numpy as jnp, smoothdiff as sd
+f = sd.black_box(lambda x: np.float32(x.mean()), jax.ShapeDtypeStruct((), jnp.float32))
+many = jax.jit(lambda xs: jax.vmap(f)(2 * xs))
+for _ in range(20):
+    means = many(jnp.ones((8, 100_000)))
+print(float(means.sum()))
+"""
+    environment = os.environ | {"NPROC": "2"}
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=300
+    )
+    assert done.stdout.strip() == "16.0", done.stderr

@@ -3,8 +3,11 @@
 Each case has a solver of its own, which takes a step when it is the case's turn, from the best of
 three: where it was, the network's answer, and what came nearest of all renders so far, whichever
 case they were made for. So cases help one another, and no case stays in a valley that others have
-shown to be a wrong one. The network is trained by AD to answer what is known to be best, which
-costs no evaluations.
+shown to be a wrong one.
+
+The network is trained by AD, which costs no evaluations: to answer what is known to be best, and
+for a render what was rendered. So it has as many pictures to learn from as there were renders, of
+which those within the range of what is known to be best count.
 
 Splitting a network where AD ends is the method of auxiliary coordinates (Carreira-Perpinan and
 Wang, Distributed optimization of deeply nested systems, 2014).
@@ -24,7 +27,8 @@ from benchmarks._task import NotAble, Solve, Task
 
 TITLE = "Network by AD, renderer by Gauss-Newton (ours)"
 CASES = 32  # whose solvers take a step at a time
-LESSONS, BATCH = 16, 32  # steps of Adam after it, and cases in each
+LESSONS, BATCH = 16, 32  # steps of Adam after it; in each so many cases, and as many renders
+KEPT = 4096  # renders to learn from, the last ones
 DOUBT = 0.2  # in units of sigma: an error beyond it may be the solver's
 RATE, DECAY = 1e-3, 0.02  # of Adam, and what is left of it at the end
 
@@ -38,12 +42,24 @@ class Known(NamedTuple):
     states: Any
 
 
+class Rendered(NamedTuple):
+    """The last renders, from old to new, and what they are of; NaN at first."""
+
+    points: jax.Array
+    shown: jax.Array
+
+    def after(self, points: jax.Array, shown: jax.Array) -> "Rendered":
+        """With these in place of the oldest."""
+        new = Rendered(points, shown)
+        return jax.tree.map(lambda a, b: jnp.concatenate([a, b])[len(b) :], self, new)
+
+
 def prepare(task: Task) -> Solve:
     """Compiles steps of the solvers and lessons of the network."""
     grey = task.grey
-    if grey is None or grey.render is None or grey.pictures is None:
-        raise NotAble("this task has no part that AD knows, or no pictures behind it")
-    render, sought = grey.render, grey.pictures[grey.cases]
+    if grey is None:
+        raise NotAble("this task has no part that AD knows")
+    render, sought = grey.render, grey.cases
     count = len(sought)
     answer = jnp.zeros_like(jax.eval_shape(grey.white, task.reference, grey.cases[0]))
     samples = sd.GaussNewton(grey.sigma).evaluations_per_step(answer)
@@ -71,7 +87,7 @@ def prepare(task: Task) -> Solve:
         return at, state, rendered
 
     @jax.jit
-    def solve_some(key, y, known, chosen):
+    def solve_some(key, y, known, rendered, chosen):
         """Steps of the solvers of some cases, from whose renders all cases learn."""
         keys = jax.random.split(key, drawn)
         said = jax.vmap(partial(grey.white, y))(grey.cases[chosen])
@@ -84,21 +100,29 @@ def prepare(task: Task) -> Solve:
         nearest = jnp.argmin(losses, axis=1)
         loss = jnp.min(losses, axis=1)
         better = loss < known.loss
-        return Known(
+        known = Known(
             jnp.where(better[:, None], points[nearest], known.best),
             jnp.where(better, loss, known.loss),
             known.at.at[chosen].set(at),
             jax.tree.map(lambda leaf, part: leaf.at[chosen].set(part), known.states, states),
         )
+        return known, rendered.after(points, shown)
 
     @jax.jit
-    def learn(key, y, state, best):
-        """One lesson on cases that have been drawn."""
-        chosen = jax.random.choice(key, count, (BATCH,))
+    def learn(key, y, state, best, rendered):
+        """One lesson on cases and renders that have been drawn."""
+        from_cases, from_renders = jax.random.split(key)
+        chosen = jax.random.choice(from_cases, count, (BATCH,))
+        low, high = jnp.min(best, axis=0), jnp.max(best, axis=0)
+        within = (rendered.points >= low[None]) & (rendered.points <= high[None])
+        share = jnp.all(within, axis=1).astype(best.dtype)
+        drawn = jax.random.choice(from_renders, KEPT, (BATCH,), p=share / jnp.sum(share))
+        pictures = jnp.concatenate([sought[chosen], rendered.shown[drawn]])
+        answers = jnp.concatenate([best[chosen], rendered.points[drawn]])
 
         def loss(y):
-            said = jax.vmap(partial(grey.white, y))(grey.cases[chosen])
-            return jnp.mean(optax.huber_loss(said, best[chosen], delta=DOUBT * grey.sigma))
+            said = jax.vmap(partial(grey.white, y))(pictures)
+            return jnp.mean(optax.huber_loss(said, answers, delta=DOUBT * grey.sigma))
 
         updates, state = optim.update(jax.grad(loss)(y), state, y)
         return optax.apply_updates(y, updates), state
@@ -108,12 +132,14 @@ def prepare(task: Task) -> Solve:
         said, shape = answers(y), jax.eval_shape(render, answer)
         begin = lambda x: solver.init(function, x, None, {"key": key}, shape, None, frozenset())
         known = Known(said, jnp.full(count, jnp.inf), said, jax.vmap(begin)(said))
+        nothing = (jnp.full((KEPT, *a.shape), jnp.nan, a.dtype) for a in (answer, shape))
+        rendered = Rendered(*nothing)
         for i in itertools.count():
             now = jax.random.fold_in(key, i)
             chosen = jnp.arange(i * drawn, (i + 1) * drawn) % count
-            known = solve_some(now, y, known, chosen)
+            known, rendered = solve_some(now, y, known, rendered, chosen)
             for lesson in jax.random.split(now, LESSONS):
-                y, state = learn(lesson, y, state, known.best)
+                y, state = learn(lesson, y, state, known.best, rendered)
             record(y)
 
     return solve

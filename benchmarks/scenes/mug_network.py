@@ -11,6 +11,7 @@ noise of all pictures is the same, so the right pose has no loss.
 """
 
 from collections.abc import Callable, Mapping
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -108,8 +109,8 @@ def network_task(
     poses = np.random.default_rng(0).uniform(-1, 1, (cases + held_out, len(spread)))
     poses = jnp.asarray(poses * spread, jnp.float32)
     pictures = jax.jit(jax.vmap(render))(poses)
-    inputs = pictures - jnp.mean(pictures, axis=0, keepdims=True)
-    inputs /= jnp.std(inputs)
+    mean = jnp.mean(pictures, axis=0)
+    contrast = jnp.std(pictures - mean[None])
     unseen = jnp.arange(cases, cases + held_out)
     clean = jax.jit(jax.vmap(cleaner))(poses[unseen])
 
@@ -122,27 +123,31 @@ def network_task(
     def flat(network: Network) -> Float[Array, "weights"]:
         return ravel_pytree(eqx.filter(network, eqx.is_array))[0]
 
-    def white(y: Float[Array, "weights"], case: Array) -> Float[Array, "outputs"]:
-        return eqx.combine(unravel(y), rest)(inputs[case])
+    def seen(picture: Float[Array, "size size 3"]) -> Float[Array, "size size 3"]:
+        return (picture - mean) / contrast
 
-    def black(pose: Float[Array, "outputs"], case: Array) -> Float[Array, ""]:
-        return jnp.mean((render(pose) - pictures[case]) ** 2)
+    def white(
+        y: Float[Array, "weights"], picture: Float[Array, "size size 3"]
+    ) -> Float[Array, "outputs"]:
+        return eqx.combine(unravel(y), rest)(seen(picture))
 
     def exact_loss(y: Float[Array, "weights"]) -> Float[Array, ""]:
-        seen = jax.vmap(lambda case: cleaner(white(y, case)))(unseen)
-        return jnp.mean((seen - clean) ** 2)
+        rendered = jax.vmap(lambda picture: cleaner(white(y, picture)))(pictures[unseen])
+        return jnp.mean((rendered - clean) ** 2)
 
     def distance(y: Float[Array, "weights"]) -> Float[Array, ""]:
-        said = jax.vmap(lambda case: white(y, case))(unseen)
+        said = jax.vmap(partial(white, y))(pictures[unseen])
         off = said - poses[unseen]
         angle = jnp.mod(off[:, 0] + jnp.pi, 2 * jnp.pi) - jnp.pi
         return jnp.sqrt(jnp.mean(off.at[:, 0].set(angle) ** 2))
 
     def image(y: Float[Array, "weights"]) -> Float[Array, "size width 3"]:
-        return jnp.concatenate([render(white(y, case)) for case in unseen[:SHOWN]], axis=1)
+        return jnp.concatenate(
+            [render(white(y, pictures[case])) for case in unseen[:SHOWN]], axis=1
+        )
 
-    grey = Grey(white, black, jnp.arange(cases), sigma, render, pictures)
-    reference = flat(solved(initial(2**31), inputs, poses, held_out))
+    grey = Grey(white, render, pictures[:cases], sigma)
+    reference = flat(solved(initial(2**31), jax.vmap(seen)(pictures), poses, held_out))
     return Task(
         name=name,
         title=title,
