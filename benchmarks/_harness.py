@@ -39,7 +39,7 @@ class Counter:
 
     The first number of the value passes through a callback that gives it back as it is. So a call
     is counted if and only if its value is used, whatever the function is made of. Not the whole
-    value: on one core JAX hangs where it is to hand a large array to a callback.
+    value: on one core JAX may hang where it is to hand more than 100 kB to a callback.
     """
 
     def __init__(self):

@@ -152,7 +152,7 @@ class _Callback:
 
     def __call__(self, *leaves: Any) -> list[np.ndarray]:
         try:
-            wait_for(leaves)
+            wait_for(leaves, self.host.name)
             samples = Samples(leaves, self.ndims, self.tree)
             outs = [np.empty((len(samples), *out.shape), out.dtype) for out in self.shapes]
             self.host(samples, outs)

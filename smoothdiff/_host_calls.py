@@ -1,6 +1,7 @@
 """Calls of a host function, one per sample or one per batch: executors, faults, checks of results.
 
-All of this runs inside JAX's callback, where any call into JAX can hang: NumPy only, no JAX here.
+All of this runs inside JAX's callback, where any call into JAX can hang: NumPy only, no JAX here,
+but for asking an array whether it is there.
 """
 
 import collections
@@ -27,22 +28,24 @@ class BlackBoxError(RuntimeError):
     """
 
 
-def wait_for(leaves: Sequence[Any], seconds: float = 60.0) -> None:
-    """Waits until JAX has handed over the arguments; raises where it never will.
+def wait_for(leaves: Sequence[Any], name: str, seconds: float = 60.0) -> None:
+    """Waits until JAX has handed over the arguments; raises where it seems that it never will.
 
     Args:
         leaves: What a callback was given. JAX copies arrays of more than 100 kB by a thread of its
-            pool. Where that has one thread, the thread is busy with the callback, and
-            `numpy.asarray` would wait forever (jax-ml/jax #25861).
+            pool. If all of them are busy with callbacks, as the only one of a process on one core
+            may be, `numpy.asarray` would wait forever (jax-ml/jax #25861).
+        name: Of the host function.
         seconds: How long to wait at most.
     """
     end = time.monotonic() + seconds
     while not all(getattr(leaf, "is_ready", lambda: True)() for leaf in leaves):
         if time.monotonic() > end:
             raise BlackBoxError(
-                f"JAX did not hand over the arguments within {seconds:g} s. Where a process has "
-                "one core, JAX has one thread, which cannot copy large arguments while it waits "
-                "for a host function: set the environment variable NPROC=2 before Python starts"
+                f"{name}: JAX did not hand over the arguments within {seconds:g} s. Usually that "
+                "is because the process has one core, so that JAX has one thread, which cannot "
+                "copy large arguments while it waits for a host function: set the environment "
+                "variable NPROC=2 before Python starts"
             )
         time.sleep(1e-4)
 

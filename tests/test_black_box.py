@@ -716,12 +716,19 @@ class Slow:
         return self.looks < 0
 
 
-def test_arguments_that_never_arrive_raise_instead_of_hanging():
-    wait_for([np.ones(3), Slow(3)], seconds=60.0)
-    with pytest.raises(BlackBoxError, match="NPROC=2"):
-        wait_for([np.ones(3), Slow(10**9)], seconds=0.05)
+def test_arguments_that_never_arrive_raise_instead_of_hanging(monkeypatch):
+    wait_for([np.ones(3), Slow(3)], "stairs", seconds=60.0)
+    with pytest.raises(BlackBoxError, match=r"stairs: .* NPROC=2"):
+        wait_for([np.ones(3), Slow(10**9)], "stairs", seconds=0.05)
+    never = lambda leaves, name: wait_for([Slow(10**9)], name, seconds=0.05)
+    monkeypatch.setattr("smoothdiff._black_box.wait_for", never)
+    # no fault of the function, so that there is no NaN in place of it either
+    f = black_box(stairs, SCALAR, on_error="nan")
+    with pytest.raises(BlackBoxError, match="NPROC=2"), reraise():
+        jax.block_until_ready(jax.jit(f)(jnp.ones(3)))
 
 
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores are chosen on Linux only")
 def test_large_arguments_arrive_where_jax_has_two_threads():
     """JAX reads NPROC as it starts, so this needs a process of its own."""
     script = """

@@ -104,17 +104,24 @@ def test_one_plateau_everywhere_widens_sigma():
     assert widths[:4] == pytest.approx([1, 2, 4, 8])
 
 
-def test_iterates_are_those_of_optimistix_to_the_last_bit(dtype):
+@pytest.mark.parametrize("restarts", [0, 9])
+def test_iterates_are_those_of_optimistix_to_the_last_bit(dtype, restarts):
     y0, target, bounds = jnp.array([8, 25], dtype), jnp.array([14, 20], dtype), (0.0, 31.0)
-    solver = sd.GaussNewton(3.0)
+    solver = sd.GaussNewton(3.0, patience=2, restarts=restarts)
     options = {"key": KEY, "bounds": bounds}
-    solution = optx.least_squares(bars, solver, y0, target, options, max_steps=8, throw=False)
-    result = sd.least_squares(bars, y0, target, key=KEY, solver=solver, max_steps=8, bounds=bounds)
+    steps = 25 if restarts else 8
+    solution = optx.least_squares(bars, solver, y0, target, options, max_steps=steps, throw=False)
+    run = partial(sd.least_squares, bars, y0, target, key=KEY, solver=solver, bounds=bounds)
+    result = run(max_steps=steps)
     np.testing.assert_array_equal(result.y, solution.value)
     for name in ("fun", "stderr", "evaluations"):
         assert getattr(result, name) == solution.stats[name]
-    # a first batch of six, seven steps of two, and the two candidates judged
-    assert result.evaluations == 6 + 7 * 2 + 2 * 6
+    begun = 1 + sum(np.array_equal(record.y, y0) for record in result.history[:-1])
+    assert (begun > 1) == bool(restarts)
+    # a first batch of six for each search, steps of two but where all are the same, and the two
+    # candidates judged
+    at_least = 6 * begun + 2 * (steps - begun) + 2 * 6
+    assert result.evaluations == at_least if not restarts else result.evaluations >= at_least
 
 
 def test_runs_inside_jit_over_pytrees():
@@ -271,6 +278,27 @@ def test_a_restart_begins_at_the_start_with_the_first_sigma():
     np.testing.assert_allclose(run.y, np.linalg.lstsq(DESIGN, DATA)[0], atol=1e-2)
 
 
+def test_a_search_that_converged_is_followed_by_the_next():
+    noise = jnp.zeros(20)
+    run = partial(sd.least_squares, decay, jnp.ones(3), noise, key=KEY)
+    once = run(solver=sd.GaussNewton(0.3, rtol=1e-2, atol=1e-2))
+    twice = run(solver=sd.GaussNewton(0.3, rtol=1e-2, atol=1e-2, restarts=1))
+    assert once.reason == twice.reason == "converged"
+    assert len(twice.history) > len(once.history)
+    np.testing.assert_allclose(twice.y, [2, 3, 0.5], atol=0.02)
+
+
+def test_many_parameters_restart():
+    sought = jnp.asarray(np.random.default_rng(0).normal(size=120), jnp.float32)
+    solver = sd.GaussNewton(0.5, patience=2, restarts=2)
+    run = sd.least_squares(
+        lambda y, args: jnp.round(4 * (y - sought)), jnp.zeros(120), key=KEY, solver=solver,
+        max_steps=40,
+    )  # fmt: skip
+    assert sum(np.array_equal(record.y, np.zeros(120)) for record in run.history) >= 2
+    assert run.fun < 0.1 * run.history[0].fun
+
+
 def test_nan_during_a_step_keeps_what_was_found():
     broken = lambda y, args: jnp.where(y[0] > 0.7, jnp.nan, 1.0) * (y - 1)
     with pytest.raises(sd.MinimiseError, match="NaN or infinite") as caught:
@@ -293,12 +321,13 @@ def test_bad_samples_are_left_out():
         lambda: sd.GaussNewton(0.1, num_samples=2),
         lambda: sd.GaussNewton(0.1, num_samples=8, history=4),
         lambda: sd.GaussNewton(0.1, restarts=-1),
+        lambda: sd.GaussNewton(0.1, patience=0),
         lambda: solve(line, jnp.zeros(3), sigma=-1.0),
         lambda: solve(tree, {"a": jnp.ones(()), "b": jnp.ones(2)}, sigma={"a": 1.0, "b": None}),
     ],
 )
 def test_bad_settings_are_refused(make):
-    with pytest.raises(ValueError, match=r"num_samples|history|restarts|sigma"):
+    with pytest.raises(ValueError, match=r"num_samples|history|restarts|patience|sigma"):
         make()
 
 

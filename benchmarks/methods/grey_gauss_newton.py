@@ -59,46 +59,52 @@ def prepare(task: Task) -> Solve:
     grey = task.grey
     if grey is None:
         raise NotAble("this task has no part that AD knows")
-    render, sought = grey.render, grey.cases
-    count = len(sought)
-    answer = jnp.zeros_like(jax.eval_shape(grey.white, task.reference, grey.cases[0]))
+    render, pictures = grey.render, grey.cases
+    count = len(pictures)
+    answer = jnp.zeros_like(jax.eval_shape(grey.white, task.reference, pictures[0]))
     samples = sd.GaussNewton(grey.sigma).evaluations_per_step(answer)
     solver = sd.GaussNewton(grey.sigma, num_samples=samples, history=2 * samples)
     function = lambda x, picture: (render(x) - picture, None)
     drawn = min(CASES, count)
     rounds = task.budget.evaluations // (drawn * (samples + 2))
     optim = optax.adam(optax.linear_schedule(RATE, DECAY * RATE, rounds * LESSONS))
-    answers = jax.jit(lambda y: jax.vmap(partial(grey.white, y))(grey.cases))
+    answers = jax.jit(lambda y: jax.vmap(partial(grey.white, y))(pictures))
 
     def step(key, said, best, loss, at, state, picture):
         """One step of one solver, and what was rendered for it."""
         tried = jnp.stack([at, said])
         shown = jax.vmap(render)(tried)
-        losses = jnp.append(_loss(shown, picture[None]), loss)
+        losses = jnp.append(_finite(jnp.mean((shown - picture[None]) ** 2, (1, 2, 3))), loss)
         start = jnp.append(tried, best[None], axis=0)[jnp.argmin(losses)]
         jump = jnp.sqrt(jnp.mean((start - at) ** 2)) / grey.sigma
         scale = state.search.scale
         scale = jnp.clip(jump, scale, jnp.maximum(scale, 1))
         state = eqx.tree_at(lambda state: state.search.scale, state, scale)
         at, state, _ = solver.step(function, start, picture, {"key": key}, state, frozenset())
-        points = state.search.history.points[-samples:]
-        seen = state.search.history.residuals[-samples:].reshape(samples, *picture.shape)
-        rendered = jnp.concatenate([tried, points]), jnp.concatenate([shown, seen + picture[None]])
-        return at, state, rendered
+        points, residuals, valid = (
+            leaf[-samples:]
+            for leaf in (
+                state.search.history.points,
+                state.search.history.residuals,
+                state.search.history.valid,
+            )
+        )
+        seen = residuals.reshape(samples, *picture.shape) + picture[None]
+        seen = jnp.where(valid[:, None, None, None], seen, jnp.nan)
+        return at, state, Rendered(jnp.append(tried, points, 0), jnp.append(shown, seen, 0))
 
     @jax.jit
     def solve_some(key, y, known, rendered, chosen):
         """Steps of the solvers of some cases, from whose renders all cases learn."""
         keys = jax.random.split(key, drawn)
-        said = jax.vmap(partial(grey.white, y))(grey.cases[chosen])
+        said = jax.vmap(partial(grey.white, y))(pictures[chosen])
         best, loss, at, states = jax.tree.map(lambda leaf: leaf[chosen], known)
-        at, states, (points, shown) = jax.vmap(step)(
-            keys, said, best, loss, at, states, sought[chosen]
-        )
-        points, shown = (a.reshape(-1, *a.shape[2:]) for a in (points, shown))
-        losses = jax.lax.map(lambda picture: _loss(shown, picture[None]), sought)
-        nearest = jnp.argmin(losses, axis=1)
-        loss = jnp.min(losses, axis=1)
+        at, states, new = jax.vmap(step)(keys, said, best, loss, at, states, pictures[chosen])
+        points, shown = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), new)
+        # nearest by products of matrices, and then as exactly as before
+        flat, wanted = shown.reshape(len(shown), -1), pictures.reshape(count, -1)
+        nearest = jnp.argmin(_finite(jnp.sum(flat**2, 1)[None] - 2 * wanted @ flat.T), axis=1)
+        loss = _finite(jnp.mean((flat[nearest] - wanted) ** 2, axis=1))
         better = loss < known.loss
         known = Known(
             jnp.where(better[:, None], points[nearest], known.best),
@@ -111,20 +117,26 @@ def prepare(task: Task) -> Solve:
     @jax.jit
     def learn(key, y, state, best, rendered):
         """One lesson on cases and renders that have been drawn."""
-        from_cases, from_renders = jax.random.split(key)
-        chosen = jax.random.choice(from_cases, count, (BATCH,))
+        of_cases, of_renders = jax.random.split(key)
+        case = jax.random.choice(of_cases, count, (BATCH,))
         low, high = jnp.min(best, axis=0), jnp.max(best, axis=0)
         within = (rendered.points >= low[None]) & (rendered.points <= high[None])
-        share = jnp.all(within, axis=1).astype(best.dtype)
-        drawn = jax.random.choice(from_renders, KEPT, (BATCH,), p=share / jnp.sum(share))
-        pictures = jnp.concatenate([sought[chosen], rendered.shown[drawn]])
-        answers = jnp.concatenate([best[chosen], rendered.points[drawn]])
+        within = within.all(axis=1) & jnp.isfinite(rendered.shown).all(axis=(1, 2, 3))
+        share = within.astype(best.dtype)
+        # where there are no renders to learn from, what is drawn has no weight
+        number = jax.random.choice(of_renders, KEPT, (BATCH,), p=share / jnp.sum(share))
+        weight = jnp.append(jnp.ones(BATCH), within[number])
+        shown = jnp.where(within[number][:, None, None, None], rendered.shown[number], 0)
+        inputs = jnp.append(pictures[case], shown, axis=0)
+        targets = jnp.append(best[case], rendered.points[number], axis=0)
+        targets = jnp.where(weight[:, None] > 0, targets, 0)
 
-        def loss(y):
-            said = jax.vmap(partial(grey.white, y))(pictures)
-            return jnp.mean(optax.huber_loss(said, answers, delta=DOUBT * grey.sigma))
+        def misfit(y):
+            said = jax.vmap(partial(grey.white, y))(inputs)
+            each = optax.huber_loss(said, targets, delta=DOUBT * grey.sigma)
+            return jnp.mean(weight[:, None] * each)
 
-        updates, state = optim.update(jax.grad(loss)(y), state, y)
+        updates, state = optim.update(jax.grad(misfit)(y), state, y)
         return optax.apply_updates(y, updates), state
 
     def solve(y0, key, record):
@@ -135,15 +147,16 @@ def prepare(task: Task) -> Solve:
         nothing = (jnp.full((KEPT, *a.shape), jnp.nan, a.dtype) for a in (answer, shape))
         rendered = Rendered(*nothing)
         for i in itertools.count():
-            now = jax.random.fold_in(key, i)
+            solving, learning = jax.random.split(jax.random.fold_in(key, i))
             chosen = jnp.arange(i * drawn, (i + 1) * drawn) % count
-            known, rendered = solve_some(now, y, known, rendered, chosen)
-            for lesson in jax.random.split(now, LESSONS):
+            known, rendered = solve_some(solving, y, known, rendered, chosen)
+            for lesson in jax.random.split(learning, LESSONS):
                 y, state = learn(lesson, y, state, known.best, rendered)
             record(y)
 
     return solve
 
 
-def _loss(shown: jax.Array, picture: jax.Array) -> jax.Array:
-    return jnp.mean((shown - picture) ** 2, axis=tuple(range(1, shown.ndim)))
+def _finite(losses: jax.Array) -> jax.Array:
+    """What is not finite is the worst."""
+    return jnp.where(jnp.isfinite(losses), losses, jnp.inf)

@@ -53,27 +53,6 @@ class ResidualSearch(eqx.Module):
             jnp.where(small, self.small + 1, 0),
         )
 
-    def wanted(
-        self,
-        flat: Bool[Array, ""],
-        history: History,
-        here: Float[Array, " P"],
-        u: Float[Array, "M n"],
-        error: Float[Array, " n"],
-        length: Float[Array, ""],
-    ) -> Float[Array, ""]:
-        """The next scale, from the step's standard error and its length.
-
-        `u` are the points of the history as the iterate sees them, `here` its residuals. Where the
-        whole batch is `flat`, the scale doubles.
-        """
-        # a plateau of the residuals around the iterate is seen whole or not at all
-        plateau = history.valid & jnp.all(history.residuals == here[None], axis=1)
-        extent = jnp.max(jnp.where(plateau, jnp.sqrt(jnp.mean(u**2, axis=1)), 0))
-        wanted = jnp.maximum(2 * jnp.sqrt(jnp.mean(error**2)), length)
-        wanted = jnp.clip(jnp.maximum(wanted, extent), _SHRINK, _GROW)
-        return jnp.where(flat, 2 * self.scale, jnp.minimum(wanted * self.scale, _WIDEST))
-
     def converged(self) -> Bool[Array, ""]:
         """Whether the last steps were small."""
         return self.small >= _SMALL
@@ -81,3 +60,31 @@ class ResidualSearch(eqx.Module):
     def over(self, patience: int) -> Bool[Array, ""]:
         """Whether it converged, or `patience` steps in a row gave no lower estimate."""
         return self.converged() | (self.stale >= patience)
+
+
+def next_scale(
+    scale: Float[Array, ""],
+    flat: Bool[Array, ""],
+    history: History,
+    here: Float[Array, " P"],
+    u: Float[Array, "M n"],
+    error: Float[Array, " n"],
+    length: Float[Array, ""],
+) -> Float[Array, ""]:
+    """How wide the next batch is, relative to sigma.
+
+    Args:
+        scale: That of this batch.
+        flat: The whole batch is the same; then the next one is twice as wide.
+        history: All samples, this batch included.
+        here: The residuals at the iterate.
+        u: The points of the history as the iterate sees them.
+        error: The standard error of the step.
+        length: Of the step.
+    """
+    # a plateau of the residuals around the iterate is seen whole or not at all
+    plateau = history.valid & jnp.all(history.residuals == here[None], axis=1)
+    extent = jnp.max(jnp.where(plateau, jnp.sqrt(jnp.mean(u**2, axis=1)), 0))
+    wanted = jnp.maximum(2 * jnp.sqrt(jnp.mean(error**2)), length)
+    wanted = jnp.clip(jnp.maximum(wanted, extent), _SHRINK, _GROW)
+    return jnp.where(flat, 2 * scale, jnp.minimum(wanted * scale, _WIDEST))

@@ -27,8 +27,8 @@ from smoothdiff._solvers._local_steps import TRIED, steps_to_try
 from smoothdiff._solvers._parameter_regression import gauss_newton_step
 from smoothdiff._solvers._residual_batch import ResidualBatch, Residuals, around
 from smoothdiff._solvers._residual_history import History
-from smoothdiff._solvers._residual_search import ResidualSearch
-from smoothdiff._solvers._restarts import Restarts
+from smoothdiff._solvers._residual_search import ResidualSearch, next_scale
+from smoothdiff._solvers._restarts import Restarts, check_restarts
 
 # the longest step of any parameter, in units of its sigma: beyond it nothing has been seen
 _LONGEST = 2.0
@@ -97,14 +97,15 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         atol: absolute tolerance. By default both are zero, and the run uses up its budget.
         norm: the norm of steps and iterates.
         patience: with restarts, so many steps in a row without a lower estimate end a search, as
-            convergence does. The last search goes on.
+            convergence does. The last search goes on, and so does the only one.
         restarts: how many searches may follow, each from the first point and with the first sigma,
             but with other random numbers: for residuals with several minima, or with plateaus at
-            the start. The best point of all is returned.
+            the start. The best point of all is returned. A schedule of sigma goes on where it was.
 
     Raises:
-        ValueError: fewer than 3 evaluations a step, a history that holds less than a step, negative
-            restarts, another word for `nonfinite`; and, when it runs, a leaf without a sigma.
+        ValueError: fewer than 3 evaluations a step, a history that holds less than a step, a
+            patience of no step, negative restarts, another word for `nonfinite`; and, when it runs,
+            a leaf without a sigma.
         TypeError: residuals that are no real floating-point numbers.
 
     Example:
@@ -161,8 +162,7 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             raise ValueError(
                 f"history={history} is less than num_samples={num_samples}: keep at least a batch"
             )
-        if restarts < 0:
-            raise ValueError(f"restarts must be 0 or more: {restarts}")
+        check_restarts(patience, restarts)
         self.sigma = sigma
         self.num_samples = num_samples
         self.history = history
@@ -250,7 +250,7 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         params = self._params(y, progress.step, options)
         residuals = Residuals(fn, args, params, self.batch_size)
         key = jax.random.fold_in(read_options(options)[0], progress.step)
-        first, _, tried = self._evaluations(y)
+        count, _, tried = self._evaluations(y)
         sigma = params.sigma * search.scale
         batch, aux = self._batch(residuals, key, sigma, y, search.seen)
         history = search.history.after(batch.points, batch.rows, batch.good, batch.count)
@@ -267,15 +267,15 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         move = move / jnp.maximum(1, longest / _LONGEST)
         if tried:
             here = batch.rows[0]
-            steps = steps_to_try(move, u, history.residuals, history.valid, here, first, *sides)
+            steps = steps_to_try(move, u, history.residuals, history.valid, here, count, *sides)
             move, longest = _best(residuals, sigma, steps, here)
         theta = params.clip(params.theta + sigma * move)
         same = batch.same()
         scale = search.scale
         if not callable(self.sigma):
             # a few that are the same call for more of them first
-            flat = same & (batch.count == first)
-            scale = search.wanted(flat, history, batch.rows[0], u, error, longest / _LONGEST)
+            flat = same & (batch.count == count)
+            scale = next_scale(scale, flat, history, batch.rows[0], u, error, longest / _LONGEST)
 
         fun, stderr = batch.loss()
         new_y = params.layout.tree(theta)
@@ -289,12 +289,11 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         restarts = state.restarts
         if restarts is not None:
             lowest = progress.best_fun < state.progress.best_fun
-            begun = ResidualSearch.start(jax.tree.map(jnp.zeros_like, history))
-            again, after, restarts = restarts.after(lowest, search.scale).next(
-                after.over(self.patience), after, begun
-            )
+            first = ResidualSearch.start(jax.tree.map(jnp.zeros_like, history))
             start = params.layout.tree(restarts.theta)
-            new_y = jax.tree.map(lambda a, b: jnp.where(again, a, b), start, new_y)
+            (new_y, after), restarts = restarts.after(lowest, search.scale).next(
+                after.over(self.patience), (new_y, after), (start, first)
+            )
         return new_y, GaussNewtonState(progress, after, restarts), aux
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
@@ -307,7 +306,7 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         key = jax.random.fold_in(read_options(options)[0], progress.step)
         count = self.evaluations_per_step(y)
         # with restarts, on the width on which the lowest estimate was made
-        scale = state.search.scale if state.restarts is None else state.restarts.width
+        scale = state.search.scale if state.restarts is None else state.restarts.kernel
 
         def estimate(y):
             params = self._params(y, progress.step, options)

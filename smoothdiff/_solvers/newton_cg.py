@@ -28,7 +28,7 @@ from smoothdiff._solvers._base import (
 )
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._noisy_step import outcome, propose, revise
-from smoothdiff._solvers._restarts import Restarts
+from smoothdiff._solvers._restarts import Restarts, check_restarts
 from smoothdiff._solvers._scalar_fit import ScalarFit, fit
 from smoothdiff._solvers._search import Search
 from smoothdiff._stderr import value_stderr
@@ -89,11 +89,12 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
             lowest so far, or the gradient is all noise, or the step is small.
         restarts: how many searches may follow, each from the first point and with the first sigma,
             but with other random numbers: for functions with several minima. The best point of all
-            is returned.
+            is returned. A schedule of sigma goes on where it was.
 
     Raises:
-        ValueError: fewer than two samples or kept ones, negative restarts, another `nonfinite`;
-            and, when it runs, a leaf without a sigma, or a sampler with weights.
+        ValueError: fewer than two samples or kept ones, a patience of no step, negative restarts,
+            another `nonfinite`; and, when it runs, a leaf without a sigma, or a sampler with
+            weights.
 
     Example:
         >>> import jax, jax.numpy as jnp, optimistix as optx, smoothdiff as sd
@@ -139,8 +140,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         for name, value in (("num_samples", num_samples), ("history", history)):
             if value is not None and value < 2:
                 raise ValueError(f"{name} must be at least 2, or None for the default: {value}")
-        if restarts < 0:
-            raise ValueError(f"restarts must be 0 or more: {restarts}")
+        check_restarts(patience, restarts)
         if nonfinite not in ("propagate", "drop"):
             raise ValueError(f'nonfinite must be "propagate" or "drop", not {nonfinite!r}')
         self.sigma = sigma
@@ -271,12 +271,11 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         if restarts is not None:
             lowest = progress.best_fun < state.progress.best_fun
             restarts = restarts.after(lowest, (metric, trust.width))
-            begun = Metric.of(params.sigma, self._adaptive)
-            first = Search.start(restarts.theta, begun, len(new_search.valid))
-            over = new_search.done(self.patience)
-            again, new_search, restarts = restarts.next(over, new_search, first)
-            new_y = jax.tree.map(
-                lambda a, b: jnp.where(again, a, b), params.layout.tree(restarts.theta), new_y
+            as_given = Metric.of(params.sigma, self._adaptive)
+            first = Search.start(restarts.theta, as_given, len(new_search.valid))
+            start = params.layout.tree(restarts.theta)
+            (new_y, new_search), restarts = restarts.next(
+                new_search.done(self.patience), (new_y, new_search), (start, first)
             )
         # the function was never evaluated at y itself, so its aux is that of a sample near y
         aux = jax.tree.map(lambda a: a[0], batch.aux)
@@ -295,7 +294,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         progress, search = state.progress, state.search
         # with restarts, on the width on which the lowest estimate was made
         kernel = search.metric, search.trust.width
-        turned, wide = kernel if state.restarts is None else state.restarts.width
+        turned, wide = kernel if state.restarts is None else state.restarts.kernel
 
         def estimate(y):
             params = self._params(y, progress.step, options)
