@@ -62,12 +62,13 @@ def _curves(results: dict[str, Any], cost: str, path: Path) -> None:
     with figure(path, 1, len(errors), (4.5 * len(errors), 3.8)) as (drawn, axes):
         for axis, error in zip(axes[0], errors, strict=True):
             panel(axis, methods, look, error, cost, strong if len(methods) > CROWDED else methods)
-        starts = max(found["starts"] for found in methods.values())
+        count = max(found["starts"] for found in methods.values())
+        starts = "1 start" if count == 1 else f"{count} starts"
         what = "medians, quartiles of ours," if len(methods) > CROWDED else "median and quartiles"
         handles, labels = axes[0, 0].get_legend_handles_labels()
         legend(drawn, handles, labels)
         drawn.suptitle(
-            f"{results['title']} ({results['setting']}): {what} over {starts} starts",
+            f"{results['title']} ({results['setting']}): {what} over {starts}",
             x=0.01,
             ha="left",
             fontsize=10,
@@ -114,7 +115,7 @@ def _images(task: Task, results: dict[str, Any], path: Path) -> None:
     rows = min(PICTURED, *(found["starts"] for found in methods.values()))
     _, unravel = ravel_pytree(task.reference)
     columns = len(methods) + 2
-    with figure(path, rows, columns, (1.7 * columns, 1.9 * rows + 0.2)) as (_, axes):
+    with figure(path, rows, columns, (1.7 * columns, 1.9 * rows + 0.7)) as (_, axes):
         for seed, line in enumerate(axes):
             runs = [found["runs"][seed] for found in methods.values()]
             found = [unravel(jnp.asarray(run["found"])) for run in runs]
