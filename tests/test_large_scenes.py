@@ -243,7 +243,13 @@ def test_cases_learn_from_each_other_and_not_from_renders_that_failed(
     task = linear_grey()
     assert task.grey is not None
     draw = task.grey.render
-    fails = lambda x: jnp.where(x[0] > 2.2, jnp.nan, draw(x))
+    failed = []
+
+    def fails(x):
+        bad = x[0] > 2.2
+        jax.debug.callback(lambda bad: failed.append(bool(bad)), bad)
+        return jnp.where(bad, jnp.nan, draw(x))
+
     grey = task.grey._replace(render=fails)
     task = dataclasses.replace(task, grey=grey, loss=grey.loss)
     # one case has a step at a time, and the others see what was rendered for it
@@ -252,6 +258,8 @@ def test_cases_learn_from_each_other_and_not_from_renders_that_failed(
         grey_gauss_newton.prepare, (grey_gauss_newton, "RATE", 0.05), monkeypatch, task
     )
     assert per_step == 6 + 2
+    jax.effects_barrier()
+    assert any(failed)
     assert np.isfinite(found).all()
     # each case has had two steps when all have learned from 32 of them
     assert task.loss(found[2 * 16]) < 0.2 * task.loss(task.start(0))
