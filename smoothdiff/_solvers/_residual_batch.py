@@ -34,23 +34,32 @@ class Residuals(eqx.Module):
 
 
 class ResidualBatch(eqx.Module):
-    """The first `count` of these rows were evaluated; the `good` ones of them are finite."""
+    """The first `count` of these rows were evaluated; the `good` ones of them are finite.
+
+    All but the `drawn` ones were made for the model alone, and may be anything: they have no part
+    in the estimate of the loss.
+    """
 
     points: Float[Array, "m n"]
     rows: Float[Array, "m P"]
     good: Bool[Array, " m"]
+    drawn: Bool[Array, " m"]
     count: Int[Array, ""]
 
     @staticmethod
-    def of(points: Array, rows: Array, count: Int[Array, ""]) -> "ResidualBatch":
-        """Rows that are not finite become zeros."""
-        good = (jnp.arange(len(rows)) < count) & jnp.isfinite(rows).all(axis=1)
-        return ResidualBatch(points, jnp.where(good[:, None], rows, 0), good, count)
+    def of(
+        points: Array, rows: Array, count: Int[Array, ""], drawn: Array | None = None
+    ) -> "ResidualBatch":
+        """Rows that are not finite become zeros. Usually all are drawn."""
+        there = jnp.arange(len(rows)) < count
+        good = there & jnp.isfinite(rows).all(axis=1)
+        drawn = there if drawn is None else there & drawn
+        return ResidualBatch(points, jnp.where(good[:, None], rows, 0), good, drawn, count)
 
     def enough(self, nonfinite: str) -> Bool[Array, ""]:
         """Whether all are good; half of them will do if the others may be dropped."""
-        lost = self.count - jnp.sum(self.good)
-        return lost == 0 if nonfinite == "propagate" else 2 * lost <= self.count
+        lost = jnp.sum(self.drawn & ~self.good)
+        return lost == 0 if nonfinite == "propagate" else 2 * lost <= jnp.sum(self.drawn)
 
     def same(self) -> Bool[Array, ""]:
         """Whether there is no difference between the residuals of the good ones."""
@@ -59,12 +68,12 @@ class ResidualBatch(eqx.Module):
 
     def loss(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """The mean of half the sum of squares over the good ones, and its standard error."""
-        values, count = jnp.sum(self.rows**2, axis=1) / 2, jnp.sum(self.good)
-        count = count.astype(values.dtype)
-        mean = jnp.sum(values) / count
-        square = jnp.sum(jnp.where(self.good, (values - mean) ** 2, 0))
+        values, used = jnp.sum(self.rows**2, axis=1) / 2, self.good & self.drawn
+        count = jnp.sum(used).astype(values.dtype)
+        mean = jnp.sum(jnp.where(used, values, 0)) / count
+        square = jnp.sum(jnp.where(used, (values - mean) ** 2, 0))
         stderr = jnp.sqrt(square / jnp.maximum(count * (count - 1), 1))
-        return mean, jnp.where(count > 1, stderr, jnp.inf)
+        return mean, jnp.where(count > 1, stderr, jnp.nan)
 
 
 def around(

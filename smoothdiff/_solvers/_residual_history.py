@@ -34,3 +34,12 @@ class History(eqx.Module):
 
         new = History(points, residuals, valid)
         return jax.tree.map(latest, self, new)
+
+    def lowest(
+        self, point: Float[Array, " n"], row: Float[Array, " P"]
+    ) -> tuple[Float[Array, " n"], Float[Array, " P"]]:
+        """Where the sum of squares was smallest, and the residuals there; else what is given."""
+        squares = jnp.where(self.valid, jnp.sum(self.residuals**2, axis=1), jnp.inf)
+        i = jnp.argmin(squares)
+        lower = squares[i] < jnp.sum(row**2)
+        return jnp.where(lower, self.points[i], point), jnp.where(lower, self.residuals[i], row)

@@ -10,6 +10,8 @@ from smoothdiff._solvers._residual_history import History
 _SHRINK, _GROW = 0.25, 1.5
 # ... and no wider than so many times what the user gave, unless all samples are the same
 _WIDEST = 2.0
+# a step is tried so many times as far, where that is at least so many times sigma
+_FURTHER, _NEAR = 5.0, 1.0
 # so many small steps in a row count as convergence
 _SMALL = 3
 
@@ -19,11 +21,12 @@ class ResidualSearch(eqx.Module):
 
     `scale` is the width relative to sigma, `seen` says that the last samples were not all the same.
     `lowest` is the lowest estimate so far, `stale` counts the steps in a row that gave no lower
-    one, and `small` those that were small.
+    one, and `small` those that were small. `move` is the last step.
     """
 
     scale: Float[Array, ""]
     history: History
+    move: Float[Array, " n"]
     seen: Bool[Array, ""]
     lowest: Float[Array, ""]
     stale: Int[Array, ""]
@@ -33,12 +36,14 @@ class ResidualSearch(eqx.Module):
     def start(history: History) -> "ResidualSearch":
         """Nothing is known but what is in the history, and samples are as wide as sigma."""
         one, none = jnp.ones((), history.points.dtype), jnp.zeros((), jnp.int32)
-        return ResidualSearch(one, history, jnp.asarray(False), jnp.inf * one, none, none)
+        still = jnp.zeros_like(history.points[0])
+        return ResidualSearch(one, history, still, jnp.asarray(False), jnp.inf * one, none, none)
 
     def after(
         self,
         scale: Float[Array, ""],
         history: History,
+        move: Float[Array, " n"],
         seen: Bool[Array, ""],
         fun: Float[Array, ""],
         small: Bool[Array, ""],
@@ -47,11 +52,17 @@ class ResidualSearch(eqx.Module):
         return ResidualSearch(
             scale,
             history,
+            move,
             seen,
             jnp.minimum(self.lowest, fun),
             jnp.where(fun < self.lowest, 0, self.stale + 1),
             jnp.where(small, self.small + 1, 0),
         )
+
+    def further(self, sigma: Float[Array, " n"]) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
+        """A step on in the direction of the last one, and whether it is worth an evaluation."""
+        step = _FURTHER * self.move
+        return step, jnp.mean((step / sigma) ** 2) > _NEAR**2
 
     def converged(self) -> Bool[Array, ""]:
         """Whether the last steps were small."""

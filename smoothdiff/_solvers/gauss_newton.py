@@ -59,7 +59,9 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     random have no say, and where all do, the step is damped as by Levenberg and Marquardt. Nothing
     larger than history x history is factorised, whatever the numbers of parameters and residuals.
     With few parameters a step is not checked by evaluations of its own; the next batch includes its
-    end point, and fits in what it finds.
+    end point, and fits in what it finds. Where five times the step is as long as sigma, it includes
+    the point there as well, in place of a sample. The next step starts from the best point of the
+    history: after a plateau or along a slope that is a long way on.
 
     With 100 parameters and more (and at least 36 evaluations a step), where a batch says little
     about each of so many, 12 of the evaluations go to the ends of 12 steps, and the best is taken
@@ -205,12 +207,21 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         return around(params, sampler, key, sigma, count)
 
     def _batch(
-        self, residuals: Residuals, key: Array, sigma: Array, y: PyTree, seen: Bool[Array, ""]
+        self, residuals: Residuals, key: Array, sigma: Array, y: PyTree, search: ResidualSearch
     ) -> tuple[ResidualBatch, PyTree]:
-        """The iterate and samples around it, fewer of them once they differ; and aux."""
-        first, later, _ = self._evaluations(y)
+        """The iterate and samples around it, fewer of them once they differ; and aux.
+
+        With few parameters one of the samples makes way for a point further on.
+        """
+        first, later, tried = self._evaluations(y)
         params = residuals.params
         points = jnp.concatenate([params.theta[None], self._points(params, key, sigma, first - 1)])
+        drawn = jnp.ones(first, bool)
+        if not tried:
+            step, worth = search.further(sigma)
+            further = params.clip(params.theta + step)
+            points = points.at[1].set(jnp.where(worth, further, points[1]))
+            drawn = drawn.at[1].set(~worth)
 
         def evaluate(count: int) -> tuple[Array, PyTree]:
             rows, aux = residuals(points[:count])
@@ -219,9 +230,9 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         if later == first:
             count, (rows, aux) = jnp.asarray(first), evaluate(first)
         else:
-            count = jnp.where(seen, later, first)
-            rows, aux = jax.lax.cond(seen, lambda: evaluate(later), lambda: evaluate(first))
-        return ResidualBatch.of(points, rows, count), aux
+            count = jnp.where(search.seen, later, first)
+            rows, aux = jax.lax.cond(search.seen, lambda: evaluate(later), lambda: evaluate(first))
+        return ResidualBatch.of(points, rows, count, drawn), aux
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> GaussNewtonState:
         """Checks what can be looked at; evaluates nothing."""
@@ -252,13 +263,15 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         key = jax.random.fold_in(read_options(options)[0], progress.step)
         count, _, tried = self._evaluations(y)
         sigma = params.sigma * search.scale
-        batch, aux = self._batch(residuals, key, sigma, y, search.seen)
+        batch, aux = self._batch(residuals, key, sigma, y, search)
         history = search.history.after(batch.points, batch.rows, batch.good, batch.count)
 
-        u = (history.points - params.theta[None]) / sigma[None]
+        center, here = params.theta, batch.rows[0]
+        if not tried:
+            center, here = history.lowest(center, here)
+        u = (history.points - center[None]) / sigma[None]
         sides = [
-            None if side is None else (side - params.theta) / sigma
-            for side in (params.low, params.high)
+            None if side is None else (side - center) / sigma for side in (params.low, params.high)
         ]
         # steps that are evaluated are so within the bounds
         known = (None, None) if tried else sides
@@ -266,16 +279,15 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         longest = jnp.max(jnp.abs(move))
         move = move / jnp.maximum(1, longest / _LONGEST)
         if tried:
-            here = batch.rows[0]
             steps = steps_to_try(move, u, history.residuals, history.valid, here, count, *sides)
             move, longest = _best(residuals, sigma, steps, here)
-        theta = params.clip(params.theta + sigma * move)
+        theta = params.clip(center + sigma * move)
         same = batch.same()
         scale = search.scale
         if not callable(self.sigma):
             # a few that are the same call for more of them first
             flat = same & (batch.count == count)
-            scale = next_scale(scale, flat, history, batch.rows[0], u, error, longest / _LONGEST)
+            scale = next_scale(scale, flat, history, here, u, error, longest / _LONGEST)
 
         fun, stderr = batch.loss()
         new_y = params.layout.tree(theta)
@@ -283,7 +295,7 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             moved = self.norm(params.layout.tree(jnp.abs(theta - params.theta) + sigma))
             small = moved < self.atol + self.rtol * self.norm(y)
         finite = batch.enough(self.nonfinite) & all_finite((fun, theta, scale))
-        after = search.after(scale, history, ~same, fun, small)
+        after = search.after(scale, history, theta - params.theta, ~same, fun, small)
         new_y, after = unless_failed(finite, (new_y, after), (y, search))
         progress = progress.after(y, fun, stderr, sigma, batch.count + tried, finite)
         restarts = state.restarts
