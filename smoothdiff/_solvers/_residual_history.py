@@ -5,6 +5,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+# a point takes the place of the iterate where its sum of squares is so many times as large: of a
+# little less the noise of the function may be the reason
+_LOWER = 0.8
+
 
 class History(eqx.Module):
     """Rows from the oldest to the newest; at first all of them are empty, and not `valid`."""
@@ -38,8 +42,8 @@ class History(eqx.Module):
     def lowest(
         self, point: Float[Array, " n"], row: Float[Array, " P"]
     ) -> tuple[Float[Array, " n"], Float[Array, " P"]]:
-        """Where the sum of squares was smallest, and the residuals there; else what is given."""
+        """Where the sum of squares was smallest, and the residuals there; if clearly smaller."""
         squares = jnp.where(self.valid, jnp.sum(self.residuals**2, axis=1), jnp.inf)
         i = jnp.argmin(squares)
-        lower = squares[i] < jnp.sum(row**2)
+        lower = squares[i] < _LOWER * jnp.sum(row**2)
         return jnp.where(lower, self.points[i], point), jnp.where(lower, self.residuals[i], row)
