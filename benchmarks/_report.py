@@ -18,6 +18,7 @@ from benchmarks._task import Task
 
 FLOORS = {"image_error": 1e-7, "parameter_error": 1e-7, "gap": 1e-10}  # the smallest error drawn
 PICTURED = 3  # starts in images.png
+ABREAST = 9  # pictures in a line of it
 LABELS = {
     "image_error": "Image error (loss), relative to the start",
     "parameter_error": "Parameter error, relative to the start",
@@ -112,23 +113,27 @@ def _images(task: Task, results: dict[str, Any], path: Path) -> None:
     """Start, found by each method, and reference, for the first starts: none is picked by hand."""
     assert task.image is not None
     methods = able(results)
-    rows = min(PICTURED, *(found["starts"] for found in methods.values()))
+    starts = min(PICTURED, *(found["starts"] for found in methods.values()))
     _, unravel = ravel_pytree(task.reference)
-    columns = len(methods) + 2
-    with figure(path, rows, columns, (1.7 * columns, 1.9 * rows + 0.7)) as (_, axes):
-        for seed, line in enumerate(axes):
+    # lines of about the same length for a start, as many as it takes
+    lines = -(-(len(methods) + 2) // ABREAST)
+    columns = -(-(len(methods) + 2) // lines)
+    size = 1.7 * columns, 2.2 * lines * starts + 0.6
+    with figure(path, lines * starts, columns, size) as (_, axes):
+        for axis in axes.flat:
+            axis.set(xticks=[], yticks=[])
+            axis.spines[:].set_visible(False)
+        for seed, places in enumerate(axes.reshape(starts, -1)):
             runs = [found["runs"][seed] for found in methods.values()]
             found = [unravel(jnp.asarray(run["found"])) for run in runs]
             shown = [task.start(seed), *found, task.reference]
-            notes = [f"{run['image_error'][-1]:.2g}" for run in runs]
+            errors = ["1", *(f"{run['image_error'][-1]:.2g}" for run in runs), "0"]
             names = ["Start", *(found["title"] for found in methods.values()), "Reference"]
-            for axis, y, name, note in zip(line, shown, names, ["1", *notes, "0"], strict=True):
+            for axis, y, name, error in zip(places, shown, names, errors, strict=False):
                 axis.imshow(display(task.image(y)), interpolation="nearest")
-                axis.set(xticks=[], yticks=[], xlabel=f"error {note}")
-                axis.spines[:].set_visible(False)
-                if seed == 0:
-                    axis.set_title(fill(name, 20), fontsize=8, loc="center")
-            line[0].set_ylabel(f"start {seed}")
+                axis.set_xlabel(f"error {error}")
+                axis.set_title(fill(name, 20), fontsize=8, loc="center")
+            places[0].set_ylabel(f"start {seed}")
 
 
 def display(image) -> np.ndarray:
