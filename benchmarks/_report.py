@@ -18,7 +18,7 @@ from benchmarks._task import Task
 
 FLOORS = {"image_error": 1e-7, "parameter_error": 1e-7, "gap": 1e-10}  # the smallest error drawn
 PICTURED = 3  # starts in images.png
-ABREAST = 9  # pictures in a line of it
+ABREAST = 10  # pictures in a line of it
 LABELS = {
     "image_error": "Image error (loss), relative to the start",
     "parameter_error": "Parameter error, relative to the start",
