@@ -75,7 +75,9 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     solution. The `fun` that is reported, and by which the result is judged, is the smoothed loss
     $\mathbb{E}_z[\frac12 \sum_p r_p(y + \sigma z)^2]$, the square first: what `minimise` would
     report for that loss. (The loss of smoothed residuals, $\frac12 \sum_p \mathbb{E}[r_p]^2$,
-    is less by half the sum of the residuals' variances.)
+    is less by half the sum of the residuals' variances.) A point further on is no sample of that: a
+    step that has one estimates from the others, which may be the iterate alone, and then knows no
+    standard error.
 
     Args:
         sigma: the smoothing width in the units of the parameters, positive for each of them. A
