@@ -265,10 +265,22 @@ def test_a_step_is_tried_five_times_as_far_and_a_better_point_is_gone_on_from():
     assert gone_on >= 2
 
 
-def test_what_is_tried_further_on_may_be_anything():
-    wall = lambda y, args: jnp.where(y > 21, jnp.nan, jnp.stack([20 - y, 1.0]))
-    result = solve(wall, jnp.array(0.0), sigma=0.5, evaluations=60)
+@pytest.mark.parametrize("beyond", [np.nan, np.inf, 1e22])
+def test_what_is_tried_further_on_may_be_anything(beyond):
+    seen, wall = [], lambda y, args: jnp.where(y > 30, beyond, jnp.stack([20 - y, 1.0]))
+    result = solve(seen_by(wall, seen), jnp.array(0.0), sigma=0.5, evaluations=60)
+    jax.effects_barrier()
+    assert max(seen) > 30
     assert result.reason == "max_evaluations"
+    np.testing.assert_allclose(result.y, 20, atol=0.05)
+
+
+def test_an_iterate_that_is_dropped_is_no_perfect_one():
+    hole = lambda y, args: jnp.where(jnp.abs(y - 1) < 0.1, jnp.nan, jnp.stack([20 - y, 1.0]))
+    result = solve(hole, jnp.array(0.0), sigma=0.5, evaluations=60, nonfinite="drop")
+    # the longest step of all leads into the hole, and the best point of the history out of it
+    assert result.history[0].y == pytest.approx(1.0)
+    assert result.history[1].y > 1.5
     np.testing.assert_allclose(result.y, 20, atol=0.05)
 
 

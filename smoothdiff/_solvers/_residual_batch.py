@@ -50,16 +50,21 @@ class ResidualBatch(eqx.Module):
     def of(
         points: Array, rows: Array, count: Int[Array, ""], drawn: Array | None = None
     ) -> "ResidualBatch":
-        """Rows that are not finite become zeros. Usually all are drawn."""
+        """Rows whose squares are not finite become zeros. Usually all are drawn."""
         there = jnp.arange(len(rows)) < count
-        good = there & jnp.isfinite(rows).all(axis=1)
+        good = there & jnp.isfinite(jnp.sum(rows**2, axis=1))
         drawn = there if drawn is None else there & drawn
         return ResidualBatch(points, jnp.where(good[:, None], rows, 0), good, drawn, count)
 
     def enough(self, nonfinite: str) -> Bool[Array, ""]:
-        """Whether all are good; half of them will do if the others may be dropped."""
-        lost = jnp.sum(self.drawn & ~self.good)
-        return lost == 0 if nonfinite == "propagate" else 2 * lost <= jnp.sum(self.drawn)
+        """Whether all that were drawn are good; if some may be dropped, half of all."""
+        if nonfinite == "propagate":
+            return ~jnp.any(self.drawn & ~self.good)
+        return 2 * jnp.sum(self.good) >= self.count
+
+    def here(self) -> Float[Array, " P"]:
+        """The residuals at the iterate, the first row; infinite if they are to be dropped."""
+        return jnp.where(self.good[0], self.rows[0], jnp.inf)
 
     def same(self) -> Bool[Array, ""]:
         """Whether there is no difference between the residuals of the good ones."""
@@ -69,6 +74,8 @@ class ResidualBatch(eqx.Module):
     def loss(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """The mean of half the sum of squares over the good ones, and its standard error."""
         values, used = jnp.sum(self.rows**2, axis=1) / 2, self.good & self.drawn
+        # where all that were drawn are dropped, another point has to do
+        used = jnp.where(jnp.any(used), used, self.good)
         count = jnp.sum(used).astype(values.dtype)
         mean = jnp.sum(jnp.where(used, values, 0)) / count
         square = jnp.sum(jnp.where(used, (values - mean) ** 2, 0))

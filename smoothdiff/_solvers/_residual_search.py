@@ -88,8 +88,8 @@ def next_scale(
         scale: That of this batch.
         flat: The whole batch is the same; then the next one is twice as wide.
         history: All samples, this batch included.
-        here: The residuals at the iterate.
-        u: The points of the history as the iterate sees them.
+        here: The residuals where the step starts, at the iterate or a better point.
+        u: The points of the history as seen from there.
         error: The standard error of the step.
         length: Of the step.
     """

@@ -61,7 +61,8 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     With few parameters a step is not checked by evaluations of its own; the next batch includes its
     end point, and fits in what it finds. Where five times the step is as long as sigma, it includes
     the point there as well, in place of a sample. The next step starts from the best point of the
-    history, if its sum of squares is a fifth less: along a slope that is a long way on.
+    history, in place of $y_t$, if its sum of squares is a fifth less: along a slope that is a long
+    way on.
 
     With 100 parameters and more (and at least 36 evaluations a step), where a batch says little
     about each of so many, 12 of the evaluations go to the ends of 12 steps, and the best is taken
@@ -270,7 +271,7 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
 
         center, here = params.theta, batch.rows[0]
         if not tried:
-            center, here = history.lowest(center, here)
+            center, here = history.lowest(center, batch.here())
         u = (history.points - center[None]) / sigma[None]
         sides = [
             None if side is None else (side - center) / sigma for side in (params.low, params.high)
