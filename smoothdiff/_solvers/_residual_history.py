@@ -42,7 +42,10 @@ class History(eqx.Module):
     def lowest(
         self, point: Float[Array, " n"], row: Float[Array, " P"]
     ) -> tuple[Float[Array, " n"], Float[Array, " P"]]:
-        """Where the sum of squares was smallest, and the residuals there; if clearly smaller."""
+        """Where the sum of squares was smallest, and the residuals there.
+
+        It is the given point, with its residuals `row`, unless those squares are clearly larger.
+        """
         squares = jnp.where(self.valid, jnp.sum(self.residuals**2, axis=1), jnp.inf)
         i = jnp.argmin(squares)
         lower = squares[i] < _LOWER * jnp.sum(row**2)

@@ -10,8 +10,8 @@ from smoothdiff._solvers._residual_history import History
 _SHRINK, _GROW = 0.25, 1.5
 # ... and no wider than so many times what the user gave, unless all samples are the same
 _WIDEST = 2.0
-# a step is tried so many times as far, where that is at least so many times sigma
-_FURTHER, _NEAR = 5.0, 1.0
+# a step is tried so many times as far, where that is at least sigma
+_FURTHER = 5.0
 # so many small steps in a row count as convergence
 _SMALL = 3
 
@@ -62,7 +62,7 @@ class ResidualSearch(eqx.Module):
     def further(self, sigma: Float[Array, " n"]) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
         """A step on in the direction of the last one, and whether it is worth an evaluation."""
         step = _FURTHER * self.move
-        return step, jnp.mean((step / sigma) ** 2) > _NEAR**2
+        return step, jnp.mean((step / sigma) ** 2) > 1
 
     def converged(self) -> Bool[Array, ""]:
         """Whether the last steps were small."""
