@@ -56,10 +56,9 @@ def errors_of(results: dict[str, Any]) -> list[str]:
 
 def _curves(results: dict[str, Any], cost: str, path: Path) -> None:
     """Median and quartiles over the starts, a panel for each error."""
-    methods, look, errors = able(results), looks(results["methods"]), errors_of(results)
+    methods, errors = able(results), errors_of(results)
     strong = {name for name, found in methods.items() if "(ours)" in found["title"]}
-    if len(methods) > CROWDED:
-        look = emphasised(look, strong)
+    look = looks(methods, strong)
     with figure(path, 1, len(errors), (4.5 * len(errors), 3.8)) as (drawn, axes):
         for axis, error in zip(axes[0], errors, strict=True):
             panel(axis, methods, look, error, cost, strong if len(methods) > CROWDED else methods)
@@ -74,12 +73,6 @@ def _curves(results: dict[str, Any], cost: str, path: Path) -> None:
             ha="left",
             fontsize=10,
         )
-
-
-def emphasised(look: dict[str, dict], strong: Container[str]) -> dict[str, dict]:
-    """Thick lines on top for some, thin ones for the others: among many, all are lost."""
-    kinds = {True: {"linewidth": 2.6, "zorder": 3}, False: {"linewidth": 1.1, "zorder": 2}}
-    return {name: line | kinds[name in strong] for name, line in look.items()}
 
 
 def panel(

@@ -1,6 +1,6 @@
 """One look for all figures: colours for colour-blind readers too, thin grids, no frames."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from itertools import cycle
 from pathlib import Path
@@ -15,6 +15,9 @@ from matplotlib.figure import Figure
 
 # Okabe and Ito 2008, without yellow, which is too pale for a line
 COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
+# for a few among many: their own colours, which none of the others have
+STRONG = ("#0072B2", "#D55E00", "#000000", "#E69F00")
+FAINT = ("#009E73", "#CC79A7", "#56B4E9", "#8C6D31", "#7F7F7F", "#9467BD")
 DASHES = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1, 1, 1, 1, 1)))
 CROWDED = 8  # methods, beyond which a legend needs a side of its own
 HANDLE, LETTER = 0.6, 0.065  # inches, of a line in a legend and of what is written beside it
@@ -59,9 +62,23 @@ def legend(drawn: Figure, handles: list, labels: list[str]) -> None:
         drawn.legend(handles, labels, loc="outside lower center", ncols=ncols)
 
 
-def looks(names) -> dict[str, dict]:
-    """A colour and a dash for each name, the same in every figure."""
+def looks(names: Collection[str], strong: Collection[str] = ()) -> dict[str, dict]:
+    """A colour and a dash for each name, the same in every figure of these names.
+
+    Among many, all lines are lost: then the `strong` ones are thick, on top, in colours of their
+    own, and the others are thin.
+    """
+    if len(names) <= CROWDED:
+        return _lines(names, COLOURS, DASHES)
+    others = [name for name in names if name not in strong]
+    thick = _lines([name for name in names if name in strong], STRONG, DASHES, linewidth=2.6)
+    thin = _lines(others, FAINT, DASHES, linewidth=1.1)
+    look = thin | {name: line | {"zorder": 3} for name, line in thick.items()}
+    return {name: look[name] for name in names}
+
+
+def _lines(names: Collection[str], colours: tuple, dashes: tuple, **rest) -> dict[str, dict]:
     return {
-        name: {"color": colour, "linestyle": dash}
-        for name, colour, dash in zip(names, cycle(COLOURS), cycle(DASHES), strict=False)
+        name: {"color": colour, "linestyle": dash, **rest}
+        for name, colour, dash in zip(names, cycle(colours), cycle(dashes), strict=False)
     }

@@ -141,8 +141,8 @@ def _curves(scene: Scene, look: _panels.Look) -> str:
     )
     starts = max(found["starts"] for found in scene.ran.values())
     return (
-        f"<figure><figcaption>Medians over {starts} starts. The thick line is ours, with its "
-        "quartiles; the lines are named in the tables.</figcaption>"
+        f"<figure><figcaption>Medians over {starts} starts. Thick lines are ours; the one "
+        "that is compared has its quartiles. The tables name the lines.</figcaption>"
         f"<div class=panels>{shown}</div></figure>"
     )
 

@@ -4,7 +4,7 @@ import io
 
 from PIL import Image
 
-from benchmarks._report import LABELS, emphasised, panel
+from benchmarks._report import LABELS, panel
 from benchmarks._style import STYLE, looks, plt
 from benchmarks.report._atlas import png_uri
 from benchmarks.report._scene import COSTS, ERRORS, Scene, all_methods
@@ -20,12 +20,14 @@ Look = dict[str, dict]
 
 def look_of(scenes) -> Look:
     """The same line for a method in every scene."""
-    return looks(all_methods(scenes))
+    names = all_methods(scenes)
+    titles = {name: found["title"] for scene in scenes for name, found in scene.ran.items()}
+    return looks(names, [name for name in names if "(ours)" in titles[name]])
 
 
 def swatches(look: Look) -> dict[str, str]:
     """A piece of each method's line, as SVG for the page."""
-    return {name: _swatch(**line) for name, line in look.items()}
+    return {name: _swatch(line["color"], line["linestyle"]) for name, line in look.items()}
 
 
 def _swatch(color: str, linestyle) -> str:
@@ -38,14 +40,12 @@ def _swatch(color: str, linestyle) -> str:
 
 def panels(scene: Scene, look: Look) -> list[tuple[str, str]]:
     """What each picture shows, and the picture as the source of an <img>."""
-    strong = {scene.ours}
-    lines = emphasised({name: look[name] for name in scene.ran}, strong)
     shown = []
     for error in ERRORS:
         for cost in COSTS:
             with plt.rc_context(STYLE):
                 drawn, axis = plt.subplots(figsize=SIZE)
-                panel(axis, scene.ran, lines, error, cost, strong)
+                panel(axis, scene.ran, look, error, cost, {scene.ours})
                 written = io.BytesIO()
                 drawn.savefig(written, format="png", dpi=DPI)
                 plt.close(drawn)

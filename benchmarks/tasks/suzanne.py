@@ -40,7 +40,7 @@ def build(full: bool) -> Task:
         REST * directions,
         faces,
         {"positions": (positions, head(directions))},
-        Budget(40_000, 1200) if full else Budget(2000, 180),
+        Budget(40_000, 1200) if full else Budget(8000, 300),
     )
 
 
