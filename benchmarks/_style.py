@@ -1,6 +1,6 @@
 """One look for all figures: colours for colour-blind readers too, thin grids, no frames."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from itertools import cycle
 from pathlib import Path
@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 # for a few among many: their own colours, which none of the others have
 STRONG = ("#0072B2", "#D55E00", "#000000", "#E69F00")
-FAINT = ("#009E73", "#CC79A7", "#56B4E9", "#8C6D31", "#7F7F7F", "#9467BD")
+FAINT = ("#009E73", "#CC79A7", "#56B4E9", "#8C6D31", "#7F7F7F", "#9467BD", "#A0A000")
 DASHES = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1, 1, 1, 1, 1)))
 CROWDED = 8  # methods, beyond which a legend needs a side of its own
 HANDLE, LETTER = 0.6, 0.065  # inches, of a line in a legend and of what is written beside it
@@ -69,16 +69,19 @@ def looks(names: Collection[str], strong: Collection[str] = ()) -> dict[str, dic
     own, and the others are thin.
     """
     if len(names) <= CROWDED:
-        return _lines(names, COLOURS, DASHES)
+        pairs = zip(cycle(COLOURS), cycle(DASHES), strict=False)
+        return _lines(names, pairs)
+    # dashes where the colours are used up
+    product = lambda colours: ((colour, dash) for dash in DASHES for colour in colours)
     others = [name for name in names if name not in strong]
-    thick = _lines([name for name in names if name in strong], STRONG, DASHES, linewidth=2.6)
-    thin = _lines(others, FAINT, DASHES, linewidth=1.1)
-    look = thin | {name: line | {"zorder": 3} for name, line in thick.items()}
+    thin = _lines(others, product(FAINT), linewidth=1.1)
+    chosen = [name for name in names if name in strong]
+    look = thin | _lines(chosen, product(STRONG), linewidth=2.6, zorder=3)
     return {name: look[name] for name in names}
 
 
-def _lines(names: Collection[str], colours: tuple, dashes: tuple, **rest) -> dict[str, dict]:
+def _lines(names: Iterable[str], pairs: Iterable[tuple], **rest) -> dict[str, dict]:
     return {
         name: {"color": colour, "linestyle": dash, **rest}
-        for name, colour, dash in zip(names, cycle(colours), cycle(dashes), strict=False)
+        for name, (colour, dash) in zip(names, pairs, strict=False)
     }

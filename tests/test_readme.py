@@ -1,0 +1,55 @@
+"""What README says to type works: its examples run, its commands and files are there."""
+
+import re
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from benchmarks import methods, tasks
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", ROOT / "benchmarks" / "README.md", ROOT / "CONTRIBUTING.md"]
+COMMANDS = ("list", "overhead", "filters", "variance", "zerograds", "stress", "report", "savings")
+COMMANDS += ("robustness", "run")
+
+
+@pytest.fixture
+def blocks():
+    return re.findall(r"```python\n(.*?)```", PAGES[0].read_text(), re.DOTALL)
+
+
+def test_examples_run_one_after_the_other(blocks):
+    names = {}
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        for block in blocks:
+            exec(block, names)
+    np.testing.assert_allclose(names["result"].y, [0.45, -0.35], atol=0.1)
+    assert np.isfinite(names["err"]).all()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_what_a_page_points_to_exists(page):
+    text = page.read_text()
+    headings = {
+        re.sub(r"[^\w -]", "", line.lower()).strip().replace(" ", "-")
+        for line in text.splitlines()
+        if line.startswith("#")
+    }
+    for target in re.findall(r"\]\(([^)]+)\)", text):
+        if target.startswith("#"):
+            assert target[1:] in headings
+        elif "://" not in target:
+            assert (page.parent / target.partition("#")[0]).exists(), target
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_commands_name_what_is_there(page):
+    for said in re.findall(r"python -m benchmarks ([^`\n]*(?:\n[^`\n]+)*)`", page.read_text()):
+        command, *rest = said.split()
+        assert command in COMMANDS, said
+        words = " ".join(rest).partition("--")[0].split()
+        assert set(words) <= {*tasks.TASKS, "all", "SCENE", "TASK"}, said
+        for names in re.findall(r"--methods\s+(\S+)", said):
+            assert set(names.split(",")) <= set(methods.METHODS), said
