@@ -1,5 +1,6 @@
 """Results as pictures and as a table on the terminal."""
 
+import math
 from collections.abc import Container
 from pathlib import Path
 from textwrap import fill
@@ -18,7 +19,7 @@ from benchmarks._task import Task
 
 FLOORS = {"image_error": 1e-7, "parameter_error": 1e-7, "gap": 1e-10}  # the smallest error drawn
 PICTURED = 3  # starts in images.png
-ABREAST = 10  # pictures in a line of it
+ABREAST = 10  # square pictures in a line of it
 LABELS = {
     "image_error": "Image error (loss), relative to the start",
     "parameter_error": "Parameter error, relative to the start",
@@ -108,10 +109,13 @@ def _images(task: Task, results: dict[str, Any], path: Path) -> None:
     methods = able(results)
     starts = min(PICTURED, *(found["starts"] for found in methods.values()))
     _, unravel = ravel_pytree(task.reference)
+    # each as large as a square of 1.7 inches, and two lines of text
+    high, wide = task.image(task.reference).shape[:2]
+    tall = math.sqrt(high / wide)
     # lines of about the same length for a start, as many as it takes
-    lines = -(-(len(methods) + 2) // ABREAST)
+    lines = -(-(len(methods) + 2) // max(1, int(ABREAST * tall)))
     columns = -(-(len(methods) + 2) // lines)
-    size = 1.7 * columns, 2.2 * lines * starts + 0.6
+    size = 1.7 / tall * columns, (1.7 * tall + 0.5) * lines * starts + 0.6
     with figure(path, lines * starts, columns, size) as (_, axes):
         for axis in axes.flat:
             axis.set(xticks=[], yticks=[])

@@ -333,6 +333,22 @@ def test_a_restart_begins_at_the_start_with_the_first_sigma():
     np.testing.assert_allclose(run.y, np.linalg.lstsq(DESIGN, DATA)[0], atol=1e-2)
 
 
+def test_a_run_resumed_in_a_later_search_ends_with_the_same_bits(tmp_path):
+    path, solver = tmp_path / "run.npz", sd.GaussNewton(0.5, patience=2, restarts=5)
+    run = partial(sd.least_squares, line, jnp.ones(3), key=KEY, solver=solver)
+    whole = run(max_steps=40)
+    begun = [i for i, r in enumerate(whole.history, 1) if np.array_equal(r.y, np.ones(3))]
+    between = begun[0] + 2
+    assert between < begun[1] < 40
+    run(max_steps=between, checkpoint=path)
+    resumed = run(max_steps=40, checkpoint=path)
+    np.testing.assert_array_equal(resumed.y, whole.y)
+    for name in ("step", "evaluations", "fun", "stderr", "sigma", "y"):
+        one, other = ([getattr(r, name) for r in result.history] for result in (resumed, whole))
+        np.testing.assert_array_equal(one, other)
+    assert (resumed.fun, resumed.evaluations) == (whole.fun, whole.evaluations)
+
+
 def test_a_search_that_converged_is_followed_by_the_next():
     noise = jnp.zeros(20)
     run = partial(sd.least_squares, decay, jnp.ones(3), noise, key=KEY)

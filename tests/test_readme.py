@@ -1,5 +1,6 @@
 """What README says to type works: its examples run, its commands and files are there."""
 
+import json
 import re
 from pathlib import Path
 
@@ -25,8 +26,8 @@ def test_examples_run_one_after_the_other(blocks):
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         for block in blocks:
             exec(block, names)
-    np.testing.assert_allclose(names["result"].y, [0.45, -0.35], atol=0.1)
-    assert np.isfinite(names["err"]).all()
+            for said in re.findall(r"result\.y\)  # close to (\[.*\])", block):
+                np.testing.assert_allclose(names["result"].y, json.loads(said), atol=0.1)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
