@@ -36,5 +36,5 @@ def build(full: bool) -> Task:
         },
         SPREAD,
         SIGMA,
-        Budget(400_000, 3600) if full else Budget(64_000, 600),
+        Budget(400_000, 3600) if full else Budget(16_000, 240),
     )
