@@ -19,6 +19,7 @@ from stripes import SIDE, TITLE, build, halving
 
 from benchmarks import __main__ as cli
 from benchmarks import methods, tasks
+from benchmarks._style import looks
 from benchmarks._summary import _of_method
 from benchmarks._task import NotAble
 from benchmarks.report import _atlas, _goals, _paper, _tables
@@ -177,6 +178,18 @@ def test_the_papers_table_is_about_methods_that_are_here():
     assert rows["FR22"] == ("3.00 (1)", "5.92 (1)", "3.00 (1)", "5.69 (1)")
     assert rows["Ours, by the rule"] == ("0.25 (1)", "", "0.25 (1)", "")
     assert _tables.beside_the_paper([scene("mirror", gauss_newton=1, our_hvpa=4)]) is None
+
+
+def test_lines_of_many_methods_differ_and_ours_stand_out():
+    names = list(methods.METHODS)
+    ours = names[::5]
+    look = looks(names, ours)
+    assert list(look) == names
+    assert len({(line["color"], line["linestyle"]) for line in look.values()}) == len(names)
+    colours = {name: line["color"] for name, line in look.items()}
+    others = [name for name in names if name not in ours]
+    assert not {colours[name] for name in ours} & {colours[name] for name in others}
+    assert min(look[o]["linewidth"] for o in ours) > max(look[o]["linewidth"] for o in others)
 
 
 def test_pictures_are_those_of_the_first_start(tmp_path):
