@@ -68,7 +68,7 @@ def looks(names: Collection[str], strong: Collection[str] = ()) -> dict[str, dic
     Among many, all lines are lost: then the `strong` ones are thick, on top, in colours of their
     own, and the others are thin.
     """
-    if len(names) <= CROWDED:
+    if not strong or len(names) <= CROWDED:
         pairs = zip(cycle(COLOURS), cycle(DASHES), strict=False)
         return _lines(names, pairs)
     # dashes where the colours are used up
