@@ -14,11 +14,10 @@ from benchmarks._task import NotAble
 RESULTS = Path(__file__).parent / "results"
 
 
-def main(arguments: list[str] | None = None, results: Path = RESULTS) -> None:
-    """Runs what the command line says; results go to benchmarks/results."""
-    arguments = sys.argv[1:] if arguments is None else arguments
-    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    commands = parser.add_subparsers(dest="command", required=True)
+def parser() -> argparse.ArgumentParser:
+    """What can be said on the command line."""
+    said = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    commands = said.add_subparsers(dest="command", required=True)
     commands.add_parser("list", help="name the tasks and the methods")
     run = commands.add_parser("run", help="run methods on tasks; what has been run is kept")
     run.add_argument(
@@ -43,7 +42,13 @@ def main(arguments: list[str] | None = None, results: Path = RESULTS) -> None:
     robustness = commands.add_parser("robustness", help="starts, samples, render noise, JPEG")
     robustness.add_argument("--full", action="store_true", help="more starts")
     robustness.add_argument("--fresh", action="store_true", help="run again what has been run")
-    options = parser.parse_args(arguments)
+    return said
+
+
+def main(arguments: list[str] | None = None, results: Path = RESULTS) -> None:
+    """Runs what the command line says; results go to benchmarks/results."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    options = parser().parse_args(arguments)
     command = " ".join(["python -m benchmarks", *arguments])
 
     if options.command == "list":

@@ -20,6 +20,7 @@ from benchmarks._task import Task
 FLOORS = {"image_error": 1e-7, "parameter_error": 1e-7, "gap": 1e-10}  # the smallest error drawn
 PICTURED = 3  # starts in images.png
 ABREAST = 10  # square pictures in a line of it
+SQUARE, TEXT = 1.7, 0.5  # inches: the side of such a picture, and two lines of text
 LABELS = {
     "image_error": "Image error (loss), relative to the start",
     "parameter_error": "Parameter error, relative to the start",
@@ -49,6 +50,11 @@ def able(results: dict[str, Any]) -> dict[str, Any]:
     return {name: found for name, found in results["methods"].items() if "runs" in found}
 
 
+def ours_of(methods: dict[str, Any]) -> set[str]:
+    """Those that are this library's."""
+    return {name for name, found in methods.items() if "(ours)" in found["title"]}
+
+
 def errors_of(results: dict[str, Any]) -> list[str]:
     """The errors by which the methods were scored."""
     methods = able(results).values()
@@ -58,14 +64,14 @@ def errors_of(results: dict[str, Any]) -> list[str]:
 def _curves(results: dict[str, Any], cost: str, path: Path) -> None:
     """Median and quartiles over the starts, a panel for each error."""
     methods, errors = able(results), errors_of(results)
-    strong = {name for name, found in methods.items() if "(ours)" in found["title"]}
+    strong = ours_of(methods) if len(methods) > CROWDED else set()
     look = looks(methods, strong)
     with figure(path, 1, len(errors), (4.5 * len(errors), 3.8)) as (drawn, axes):
         for axis, error in zip(axes[0], errors, strict=True):
-            panel(axis, methods, look, error, cost, strong if len(methods) > CROWDED else methods)
+            panel(axis, methods, look, error, cost, strong or methods)
         count = max(found["starts"] for found in methods.values())
         starts = "1 start" if count == 1 else f"{count} starts"
-        what = "medians, quartiles of ours," if len(methods) > CROWDED else "median and quartiles"
+        what = "medians, quartiles of ours," if strong else "median and quartiles"
         handles, labels = axes[0, 0].get_legend_handles_labels()
         legend(drawn, handles, labels)
         drawn.suptitle(
@@ -109,13 +115,13 @@ def _images(task: Task, results: dict[str, Any], path: Path) -> None:
     methods = able(results)
     starts = min(PICTURED, *(found["starts"] for found in methods.values()))
     _, unravel = ravel_pytree(task.reference)
-    # each as large as a square of 1.7 inches, and two lines of text
+    # each as large as a square one
     high, wide = task.image(task.reference).shape[:2]
     tall = math.sqrt(high / wide)
     # lines of about the same length for a start, as many as it takes
     lines = -(-(len(methods) + 2) // max(1, int(ABREAST * tall)))
     columns = -(-(len(methods) + 2) // lines)
-    size = 1.7 / tall * columns, (1.7 * tall + 0.5) * lines * starts + 0.6
+    size = SQUARE / tall * columns, (SQUARE * tall + TEXT) * lines * starts + 0.6
     with figure(path, lines * starts, columns, size) as (_, axes):
         for axis in axes.flat:
             axis.set(xticks=[], yticks=[])

@@ -65,12 +65,11 @@ def legend(drawn: Figure, handles: list, labels: list[str]) -> None:
 def looks(names: Collection[str], strong: Collection[str] = ()) -> dict[str, dict]:
     """A colour and a dash for each name, the same in every figure of these names.
 
-    Among many, all lines are lost: then the `strong` ones are thick, on top, in colours of their
-    own, and the others are thin.
+    Where there are many, all lines are lost: name some as `strong`, and they are thick, on top, in
+    colours of their own, and the others thin.
     """
-    if not strong or len(names) <= CROWDED:
-        pairs = zip(cycle(COLOURS), cycle(DASHES), strict=False)
-        return _lines(names, pairs)
+    if not strong:
+        return _lines(names, zip(cycle(COLOURS), cycle(DASHES), strict=False))
     # dashes where the colours are used up
     product = lambda colours: ((colour, dash) for dash in DASHES for colour in colours)
     others = [name for name in names if name not in strong]

@@ -4,7 +4,7 @@ import io
 
 from PIL import Image
 
-from benchmarks._report import LABELS, panel
+from benchmarks._report import LABELS, ours_of, panel
 from benchmarks._style import STYLE, looks, plt
 from benchmarks.report._atlas import png_uri
 from benchmarks.report._scene import COSTS, ERRORS, Scene, all_methods
@@ -20,9 +20,8 @@ Look = dict[str, dict]
 
 def look_of(scenes) -> Look:
     """The same line for a method in every scene."""
-    names = all_methods(scenes)
-    titles = {name: found["title"] for scene in scenes for name, found in scene.ran.items()}
-    return looks(names, [name for name in names if "(ours)" in titles[name]])
+    ran = {name: found for scene in scenes for name, found in scene.ran.items()}
+    return looks(all_methods(scenes), ours_of(ran))
 
 
 def swatches(look: Look) -> dict[str, str]:
