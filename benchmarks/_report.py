@@ -18,7 +18,7 @@ from benchmarks._summary import COSTS, LEVELS, band
 from benchmarks._task import Task
 
 FLOORS = {"image_error": 1e-7, "parameter_error": 1e-7, "gap": 1e-10}  # the smallest error drawn
-PICTURED = 3  # starts in images.png
+PICTURED = 3  # starts in images.png, if the pictures of one go in a line
 ABREAST = 10  # square pictures in a line of it
 SQUARE, TEXT = 1.7, 0.5  # inches: the side of such a picture, and two lines of text
 LABELS = {
@@ -50,9 +50,9 @@ def able(results: dict[str, Any]) -> dict[str, Any]:
     return {name: found for name, found in results["methods"].items() if "runs" in found}
 
 
-def ours_of(methods: dict[str, Any]) -> set[str]:
+def ours_of(methods: dict[str, Any]) -> list[str]:
     """Those that are this library's."""
-    return {name for name, found in methods.items() if "(ours)" in found["title"]}
+    return [name for name, found in methods.items() if "(ours)" in found["title"]]
 
 
 def errors_of(results: dict[str, Any]) -> list[str]:
@@ -64,7 +64,7 @@ def errors_of(results: dict[str, Any]) -> list[str]:
 def _curves(results: dict[str, Any], cost: str, path: Path) -> None:
     """Median and quartiles over the starts, a panel for each error."""
     methods, errors = able(results), errors_of(results)
-    strong = ours_of(methods) if len(methods) > CROWDED else set()
+    strong = ours_of(methods) if len(methods) > CROWDED else []
     look = looks(methods, strong)
     with figure(path, 1, len(errors), (4.5 * len(errors), 3.8)) as (drawn, axes):
         for axis, error in zip(axes[0], errors, strict=True):
@@ -113,7 +113,6 @@ def _images(task: Task, results: dict[str, Any], path: Path) -> None:
     """Start, found by each method, and reference, for the first starts: none is picked by hand."""
     assert task.image is not None
     methods = able(results)
-    starts = min(PICTURED, *(found["starts"] for found in methods.values()))
     _, unravel = ravel_pytree(task.reference)
     # each as large as a square one
     high, wide = task.image(task.reference).shape[:2]
@@ -121,6 +120,8 @@ def _images(task: Task, results: dict[str, Any], path: Path) -> None:
     # lines of about the same length for a start, as many as it takes
     lines = -(-(len(methods) + 2) // max(1, int(ABREAST * tall)))
     columns = -(-(len(methods) + 2) // lines)
+    starts = min(found["starts"] for found in methods.values())
+    starts = min(starts, PICTURED) if lines == 1 else 1
     size = SQUARE / tall * columns, (SQUARE * tall + TEXT) * lines * starts + 0.6
     with figure(path, lines * starts, columns, size) as (_, axes):
         for axis in axes.flat:

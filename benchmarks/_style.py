@@ -66,7 +66,7 @@ def looks(names: Collection[str], strong: Collection[str] = ()) -> dict[str, dic
     """A colour and a dash for each name, the same in every figure of these names.
 
     Where there are many, all lines are lost: name some as `strong`, and they are thick, on top, in
-    colours of their own, and the others thin.
+    colours of their own, the first ones solid, and the others thin.
     """
     if not strong:
         return _lines(names, zip(cycle(COLOURS), cycle(DASHES), strict=False))
@@ -74,7 +74,7 @@ def looks(names: Collection[str], strong: Collection[str] = ()) -> dict[str, dic
     product = lambda colours: ((colour, dash) for dash in DASHES for colour in colours)
     others = [name for name in names if name not in strong]
     thin = _lines(others, product(FAINT), linewidth=1.1)
-    chosen = [name for name in names if name in strong]
+    chosen = [name for name in strong if name in names]
     look = thin | _lines(chosen, product(STRONG), linewidth=2.6, zorder=3)
     return {name: look[name] for name in names}
 
