@@ -34,6 +34,7 @@ def parser() -> argparse.ArgumentParser:
     errors.add_argument("--fresh", action="store_true", help="measure again, as the code changed")
     study = commands.add_parser("zerograds", help="the tables and figures of the ZeroGrads paper")
     study.add_argument("--full", action="store_true", help="ten starts, longer runs, more samples")
+    study.add_argument("--seeds", type=int, metavar="N", help="number of starts of every study")
     study.add_argument("--fresh", action="store_true", help="run again what has been run")
     commands.add_parser("stress", help="stiff and extreme cases: expected, seen, verdict")
     page = commands.add_parser("report", help="report.html, from the results of the scenes")
@@ -82,6 +83,8 @@ def main(arguments: list[str] | None = None, results: Path = RESULTS) -> None:
         from benchmarks import zerograds
 
         size = zerograds.FULL if options.full else zerograds.QUICK
+        if options.seeds:
+            size = size.with_starts(options.seeds)
         zerograds.main(results / "zerograds", size, command=command, fresh=options.fresh)
     elif options.command == "stress":
         from benchmarks import stress

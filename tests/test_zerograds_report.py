@@ -110,6 +110,13 @@ def test_settings_name_tasks_that_are_there():
     assert set(zerograds.FULL.budgets) == groups
 
 
+def test_starts_of_every_study_are_what_was_asked_for():
+    setting = TINY.with_starts(3)
+    changed = {name for name in TINY._fields if getattr(setting, name) != getattr(TINY, name)}
+    assert changed == {"seeds", "gradient_seeds", "replay_seeds"}
+    assert {getattr(setting, name) for name in changed} == {3}
+
+
 def test_stretches_are_the_steps_of_minimise_and_are_counted(slope):
     counter = Counter()
     watched = dataclasses.replace(slope, loss=counter.watch(slope.loss))

@@ -35,7 +35,7 @@ def build(full: bool) -> Task:
         rest,
         faces,
         {"positions": (positions, bent(directions)), "albedo": (colours, painted(directions))},
-        Budget(40_000, 1200) if full else Budget(3000, 240),
+        Budget(40_000, 1200) if full else Budget(16_000, 300),
     )
 
 

@@ -38,6 +38,10 @@ class Setting(NamedTuple):
     control: tuple[str, ...]
     repeats: int
 
+    def with_starts(self, number: int) -> "Setting":
+        """The same from so many starts, in every study."""
+        return self._replace(seeds=number, gradient_seeds=number, replay_seeds=number)
+
 
 QUICK = Setting(
     name="quick",
