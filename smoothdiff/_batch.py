@@ -85,7 +85,8 @@ def evaluate(
     if nonfinite == "drop":
         valid = jnp.stack([_finite(v) for v in jax.tree.leaves(values)]).all(axis=0)
         values = jax.tree.map(lambda v: jnp.where(_like(valid, v), v, 0), values)
-    control = baseline(values, draws, log_ratio, valid, center)
+    # compiled as a whole even where the caller does not jit: op by op that takes seconds
+    control = eqx.filter_jit(baseline)(values, draws, log_ratio, valid, center)
     if valid is None:
         scale = jnp.full((), 1 / draws.num, theta.dtype)
     else:

@@ -10,6 +10,11 @@ from jaxtyping import Array, PyTree
 from smoothdiff._samplers import AbstractSampler
 
 
+@eqx.filter_jit  # without a jit of the caller's, compiling op by op takes seconds
+def _drawn(sampler: AbstractSampler, key: Array, start, count: int, num: int, n: int, dtype):
+    return sampler.draw(key, start, count, num, n, dtype)
+
+
 class Draws(eqx.Module):
     """`num` points in n dimensions. Without a chunk size they are drawn once and kept.
 
@@ -42,7 +47,7 @@ class Draws(eqx.Module):
 
     def _draw(self, start, count: int):
         key = jax.random.wrap_key_data(self.key_data, impl=self.impl)
-        return self.sampler.draw(key, start, count, self.num, self.n, self.dtype)
+        return _drawn(self.sampler, key, start, count, self.num, self.n, self.dtype)
 
     def _chunks(self, rows: PyTree) -> tuple[Array, PyTree, PyTree]:
         """Starts of the full chunks, their rows stacked, and the rows of the last, shorter one."""

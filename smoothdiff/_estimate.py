@@ -11,6 +11,7 @@ At $d = 0$, $\rho = 1$ this is p/q. Its derivatives there are all that derivativ
 function need.
 """
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
@@ -83,6 +84,7 @@ def weigh(w: Array, rows: Array) -> Array:
     return w.astype(rows.dtype).reshape(*w.shape, *[1] * (rows.ndim - w.ndim)) * rows
 
 
+@eqx.filter_jit
 def combine(
     batch: Batch, shift: Float[Array, " n"], ratio: Float[Array, " n"] | None = None
 ) -> PyTree:

@@ -14,6 +14,7 @@ vanish.
 
 from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
@@ -22,6 +23,7 @@ from smoothdiff._batch import Batch
 from smoothdiff._estimate import weigh, weights
 
 
+@eqx.filter_jit
 def value_stderr(batch: Batch, estimate: PyTree) -> PyTree:
     """The standard error of the smoothed value, leaf by leaf; of the sum of terms for a scalar."""
 
@@ -39,6 +41,7 @@ def value_stderr(batch: Batch, estimate: PyTree) -> PyTree:
     return jax.tree.map(leaf, batch.values, batch.control.errors(), estimate)
 
 
+@eqx.filter_jit
 def jacobian_stderr(batch: Batch, estimate: PyTree) -> PyTree:
     """The standard error of the derivative in units of sigma; leaves (..., n) like `estimate`."""
 
@@ -61,6 +64,7 @@ def jacobian_stderr(batch: Batch, estimate: PyTree) -> PyTree:
     return jax.tree.map(leaf, batch.control.errors(), estimate)
 
 
+@eqx.filter_jit
 def grad_stderr(batch: Batch, estimate: Float[Array, " n"]) -> Float[Array, " n"]:
     """The standard error of the gradient in units of sigma, for a scalar function."""
     residual = batch.control.errors()
@@ -68,6 +72,7 @@ def grad_stderr(batch: Batch, estimate: Float[Array, " n"]) -> Float[Array, " n"
     return _spread(batch, sums, residual, estimate, jnp.max(jnp.abs(residual)))
 
 
+@eqx.filter_jit
 def hvp_stderr(
     batch: Batch, direction: Float[Array, " n"], estimate: Float[Array, " n"]
 ) -> Float[Array, " n"]:
@@ -81,6 +86,7 @@ def hvp_stderr(
     return _spread(batch, sums, residual, estimate, jnp.max(jnp.abs(residual)))
 
 
+@eqx.filter_jit
 def free_grad_stderr(batch: Batch, per_row: Array) -> tuple[Array, Array]:
     """Sum and standard error of a derivative by AD that is given in parts, one for each sample."""
     flat = per_row.reshape(len(per_row), -1)
