@@ -93,6 +93,9 @@ def test_runs_writes_and_resumes(monkeypatch, tmp_path, capsys):
     def run_again(*_, **__):
         raise AssertionError("run again")
 
+    for name in ("toy", "control_variate"):  # these keep nothing
+        kept = results[name]
+        monkeypatch.setattr(zerograds.PARTS[name], "measure", lambda *_, kept=kept: kept)
     monkeypatch.setattr(_loop, "Steps", run_again)
     monkeypatch.setattr(gradients.Descent, "__call__", run_again)
     zerograds.main(tmp_path, TINY, command="a test")

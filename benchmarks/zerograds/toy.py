@@ -50,7 +50,7 @@ def task(seen: list[float]) -> Task:
         title="A staircase",
         loss=box,
         exact_loss=box,
-        start=lambda seed: jnp.asarray(START),
+        start=lambda seed: jnp.asarray(START, jnp.float32),
         reference=jnp.asarray(REFERENCE),
         bounds=(jnp.zeros(()), jnp.ones(())),
         sigma=SIGMA,
