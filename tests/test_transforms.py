@@ -1,5 +1,6 @@
 """The transforms agree with AD of `smooth`, with the published formulas, and with closed forms."""
 
+import logging
 from typing import Any
 
 import jax
@@ -272,3 +273,10 @@ def test_jacobian_of_pytree_outputs_is_that_of_ad(wide, key, x64):
     estimate, error = jax.jit(errors)(key, p)
     assert_same(estimate, want, np.float64)
     assert jax.tree.map(jnp.shape, error) == jax.tree.map(jnp.shape, want)
+
+
+def test_without_jit_the_parts_are_compiled_as_wholes(caplog):
+    """Op by op a first gradient would be 190 programs, which take seconds to compile."""
+    with jax.log_compiles(), caplog.at_level(logging.WARNING):
+        sd.smooth_grad(lambda x: jnp.sum(jnp.floor(x) ** 2), 0.3)(jax.random.key(0), jnp.ones(3))
+    assert sum("Finished XLA compilation" in r.getMessage() for r in caplog.records) <= 40

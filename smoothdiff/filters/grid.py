@@ -8,6 +8,7 @@ import itertools
 import math
 import operator
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -223,6 +224,7 @@ def _largest(dtype: np.dtype) -> float:
     return float(jnp.finfo(dtype).max)
 
 
+@partial(jax.jit, static_argnames="step")
 def _smooth(
     signals: list[Array],
     guides: list[Array],
