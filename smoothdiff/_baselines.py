@@ -78,7 +78,8 @@ class AbstractBaseline(eqx.Module):
     ) -> Control:
         """Subtracts the baseline from `values`, whose leaves have one leading row per sample.
 
-        `center` is f(theta) if `evaluations()` asked for it, else None.
+        `center` is f(theta) if `evaluations()` asked for it, else None. Traced by JAX, always: no
+        value can be looked at.
         """
 
 

@@ -84,7 +84,7 @@ def weigh(w: Array, rows: Array) -> Array:
     return w.astype(rows.dtype).reshape(*w.shape, *[1] * (rows.ndim - w.ndim)) * rows
 
 
-@eqx.filter_jit
+@eqx.filter_jit  # a program of its own where the caller does not jit, as in `_draws`, `_batch`
 def combine(
     batch: Batch, shift: Float[Array, " n"], ratio: Float[Array, " n"] | None = None
 ) -> PyTree:

@@ -43,7 +43,8 @@ class AbstractSampler(eqx.Module):
 
         Returns:
             The points, and the logarithms of normal density over proposal density; None for the
-            latter if the points are normal. `start` and `count` are multiples of the block.
+            latter if the points are normal. `start` and `count` are multiples of the block. Traced
+            by JAX, always: no value can be looked at.
         """
 
     def check(self, num_samples: int, n: int) -> None:

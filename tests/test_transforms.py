@@ -277,6 +277,8 @@ def test_jacobian_of_pytree_outputs_is_that_of_ad(wide, key, x64):
 
 def test_without_jit_the_parts_are_compiled_as_wholes(caplog):
     """Op by op a first gradient would be 190 programs, which take seconds to compile."""
+    jax.clear_caches()  # what other tests have compiled would not be counted
     with jax.log_compiles(), caplog.at_level(logging.WARNING):
         sd.smooth_grad(lambda x: jnp.sum(jnp.floor(x) ** 2), 0.3)(jax.random.key(0), jnp.ones(3))
-    assert sum("Finished XLA compilation" in r.getMessage() for r in caplog.records) <= 40
+    programs = sum("Finished XLA compilation" in r.getMessage() for r in caplog.records)
+    assert 1 <= programs <= 40

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
 from benchmarks._task import Solve, Task, Y
 
@@ -25,9 +24,7 @@ class Steps:
         """The state before the first step."""
         value = jax.eval_shape(self._task.loss, y)
         options = self._options(key)
-        state = self._solver.init(self._fun, y, None, options, value, None, frozenset())
-        # weak types would compile the second step anew
-        return jax.tree.map(lambda a: jnp.asarray(a, a.dtype), state)
+        return self._solver.init(self._fun, y, None, options, value, None, frozenset())
 
     def step(self, y: Y, state: Any, key: jax.Array) -> tuple[Y, Any]:
         """The next parameters and state. The key is the same for all steps of a run."""

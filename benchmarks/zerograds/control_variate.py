@@ -63,7 +63,7 @@ def along(task: Task, seed: int, repeats: int) -> dict[str, list[float]]:
     steps, key = Steps(solver, task), jax.random.key(seed)
     ratios = {name: jax.jit(_ratio(task, solver, name, repeats)) for name in BASELINES}
     y, done = task.start(seed), 0
-    state = steps.init(y, key)
+    state = jax.jit(steps.init)(y, key)
     found = {name: [] for name in BASELINES}
 
     @jax.jit

@@ -69,7 +69,7 @@ def measure(setting: Setting, folder: Path, fresh: bool) -> dict[str, Any]:
     surrogate = MLP(1, key=jax.random.key(1))
     steps = Steps(configurations.ours(problem, surrogate=surrogate), problem)
     y, key = problem.start(0), jax.random.key(0)
-    state, step = steps.init(y, key), jax.jit(steps.step)
+    state, step = jax.jit(steps.init)(y, key), jax.jit(steps.step)
     marks = {round(share * steps.number): share for share in SHOWN}
     frames = []
     for done in range(steps.number + 1):
