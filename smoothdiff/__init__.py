@@ -20,9 +20,10 @@ from smoothdiff._smooth import smooth, smooth_grad, smooth_jacobian, smooth_valu
 from smoothdiff._smooth_second import smooth_hessian, smooth_hvp, smooth_quadratic
 from smoothdiff._solvers.first_order import FirstOrder
 from smoothdiff._solvers.gauss_newton import GaussNewton
+from smoothdiff._solvers.local_gauss_newton import LocalGaussNewton
 from smoothdiff._solvers.newton_cg import NewtonCG
 from smoothdiff._solvers.zerograds import ZeroGrads
-from smoothdiff._support import local_support, matrix_support, probe_support
+from smoothdiff._support import local_support, matrix_support, moving_support, probe_support
 
 __version__ = "0.1.0"
 
@@ -38,6 +39,7 @@ __all__ = [
     "HessianOperator",
     "Importance",
     "LeastSquares",
+    "LocalGaussNewton",
     "MinimiseError",
     "NewtonCG",
     "Noise",
@@ -61,6 +63,7 @@ __all__ = [
     "local_support",
     "matrix_support",
     "minimise",
+    "moving_support",
     "newton_step",
     "probe_support",
     "scale_by_filtered_adam",

@@ -80,6 +80,9 @@ def evaluate(
     center = fun(params.clip(theta), params.free)[0] if extra else None
     _check_values(values)
     if support is not None:
+        if params.free:
+            raise ValueError("support needs a sigma for every leaf of the parameters")
+        support = support.at(params.layout.tree(theta))
         _check_support(support, params, baseline, values, log_ratio)
     valid = None
     if nonfinite == "drop":
@@ -123,8 +126,6 @@ def _check_support(
     values: PyTree,
     log_ratio: Array | None,
 ) -> None:
-    if params.free:
-        raise ValueError("support needs a sigma for every leaf of the parameters")
     if log_ratio is not None:
         raise ValueError("support needs points that are normal themselves: Gaussian, Sobol, ...")
     if not baseline.termwise:

@@ -16,6 +16,10 @@ from smoothdiff._params import as_key, take_apart
 class AbstractSupport(eqx.Module):
     """A linear map from parameter-shaped to term-shaped arrays whose matrix has entries 0 and 1."""
 
+    def at(self, params: PyTree) -> "AbstractSupport":
+        """The support around these parameters: this one, unless it moves with them."""
+        return self
+
     def __call__(self, params: PyTree) -> Array:
         """For each term, the sum over the parameters that may influence it."""
         raise NotImplementedError
@@ -65,6 +69,21 @@ class MatrixSupport(AbstractSupport):
         vector = flat[0] if len(flat) == 1 else jnp.concatenate(flat)
         sums = jax.ops.segment_sum(vector[self.params], self.terms, math.prod(self.shape))
         return sums.reshape(self.shape)
+
+
+class MovingSupport(AbstractSupport):
+    """See `moving_support`; `where` it is comes from `at`."""
+
+    around: Callable[[PyTree], Callable[[PyTree], Array]] = eqx.field(static=True)
+    where: PyTree = None
+
+    def at(self, params: PyTree) -> "MovingSupport":
+        return MovingSupport(self.around, params)
+
+    def __call__(self, params: PyTree) -> Array:
+        if self.where is None:
+            raise ValueError("a moving support is one only somewhere: use support.at(params)")
+        return self.around(self.where)(params)
 
 
 def local_support(radius: int, *, ndim: int = 2) -> LocalSupport:
@@ -124,6 +143,34 @@ def matrix_support(matrix: Any, shape: tuple[int, ...] | None = None) -> MatrixS
         raise ValueError(f"{matrix.shape[0]} rows are not terms of shape {shape}")
     terms, params = matrix.nonzero()
     return MatrixSupport(jnp.asarray(terms), jnp.asarray(params), shape)
+
+
+def moving_support(around: Callable[[PyTree], Callable[[PyTree], Array]]) -> MovingSupport:
+    """A support that depends on where the parameters are: that of a body which moves, say.
+
+    Transforms and solvers ask for it at each point where they sample.
+
+    Args:
+        around: from the parameters to the support around them, a linear function like any other.
+            It is traced, so it may look at their values as JAX functions do.
+
+    Returns:
+        A callable for the option `support`.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, smoothdiff as sd
+        >>> pixels = jnp.arange(10.0)
+        >>> bars = lambda y: jnp.any(jnp.abs(pixels[:, None] - y[None]) < 1, axis=1).astype(float)
+        >>> terms = lambda y: (bars(y) - bars(jnp.array([2.0, 7.0]))) ** 2
+        >>> near = lambda y: (jnp.abs(pixels[:, None] - y[None]) < 3).astype(float)
+        >>> support = sd.moving_support(lambda y: lambda params: near(y) @ params)
+        >>> g = sd.smooth_grad(terms, 0.5, support=support)
+        >>> print(jnp.sign(g(jax.random.key(0), jnp.array([2.8, 6.3]))))
+        [ 1. -1.]
+    """
+    if not callable(around):
+        raise TypeError(f"around must be a function of the parameters, not {around!r}")
+    return MovingSupport(around)
 
 
 def probe_support(

@@ -52,6 +52,7 @@ METHODS = {
     "zerograds": "benchmarks.methods.zerograds",
     "newton_cg": "benchmarks.methods.newton_cg",
     "gauss_newton": "benchmarks.methods.gauss_newton",
+    "local_gauss_newton": "benchmarks.methods.local_gauss_newton",
 }
 
 # what runs unless more is asked for: the usual choices, the papers' best, and ours

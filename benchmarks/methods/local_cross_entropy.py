@@ -26,12 +26,11 @@ SHARE = 0.7  # of the new mean and spread; the rest is that of the generation be
 def prepare(task: Task) -> Solve:
     """Compiles a generation."""
     flat, terms, support = local(task)
-    blame = jax.linear_transpose(support, flat.low)
-    scores = jax.vmap(lambda x: blame(terms(x))[0])
 
-    def fit(points):
+    def fit(points, middle):
         """Mean and spread of the elite of each parameter; who is as good as the last is in it."""
-        found = scores(points)
+        blame = jax.linear_transpose(support.at(middle), middle)
+        found = jax.vmap(lambda x: blame(terms(x))[0])(points)
         worst = jnp.sort(found, axis=0)[ELITE - 1]
         weights = (found <= worst).astype(flat.dtype)
         weights = weights / weights.sum(0)
@@ -46,12 +45,13 @@ def prepare(task: Task) -> Solve:
         numbers = jnp.broadcast_to(jnp.arange(POPULATION, dtype=flat.dtype)[:, None], shape)
         shuffled = jax.random.permutation(layer, numbers, independent=True)
         even = (shuffled + jax.random.uniform(place, shape, flat.dtype)) / POPULATION
-        return fit(flat.low + (flat.high - flat.low) * even)
+        points = flat.low + (flat.high - flat.low) * even
+        return fit(points, (flat.low + flat.high) / 2)
 
     @jax.jit
     def generation(key, mean, spread):
         z = jax.random.normal(key, (POPULATION, flat.size), flat.dtype)
-        new = fit(flat.clip(mean + spread * z))
+        new = fit(flat.clip(mean + spread * z), mean)
         blend = lambda old, new: (1 - SHARE) * old + SHARE * new
         return jax.tree.map(blend, (mean, spread), new)
 

@@ -28,8 +28,7 @@ LAM = 19.0
 SIGMA, BOUND = 0.03, 0.3
 EXTENT = 1.25  # what a view shows, from its middle
 TILE = 2  # pixels, along each side of what is one term of the loss
-REACH = 0.3  # how far a perturbation is seen around a vertex
-STRETCH = (0.75, 1.0, 1.25, 1.5)  # of the way from the middle to a vertex: where it may come to be
+REACH = 0.15  # how far a perturbation is seen around a vertex
 BEHIND = 0.3  # the cosine of normals and the view, from where on a vertex is never seen
 
 
@@ -90,13 +89,14 @@ def mesh_task(
 
     target = jax.jit(pictures)(reference)
 
-    def residuals(y: dict[str, Array]) -> Float[Array, "views size size 3"]:
-        return pictures(y) - target
+    def residuals(y: dict[str, Array]) -> Float[Array, "views tiles tiles rest"]:
+        """The pixels of a tile together."""
+        tiles = size // TILE
+        found = (pictures(y) - target).reshape(number, tiles, TILE, tiles, TILE, 3)
+        return jnp.moveaxis(found, 3, 2).reshape(number, tiles, tiles, -1)
 
     def terms(y: dict[str, Array]) -> Float[Array, "views tiles tiles"]:
-        squares = residuals(y) ** 2 / target.size
-        tiles = size // TILE
-        return jnp.sum(squares.reshape(number, tiles, TILE, tiles, TILE, 3), axis=(2, 4, 5))
+        return jnp.sum(residuals(y) ** 2, axis=-1) / target.size
 
     def start(seed: int) -> dict[str, Array]:
         noise = SIGMA / 3 * jax.random.normal(jax.random.key(seed), (len(rest), 3))
@@ -117,38 +117,39 @@ def mesh_task(
         image=lambda y: jnp.concatenate(list(pictures(y)[:4]), axis=1),
         residuals=residuals,
         terms=terms,
-        support=support(rest, faces, views),
+        support=support(soft["positions"], faces, views),
         notes=f"{number} views of {size} x {size} pixels. Vertices may slide along the "
         "surface: the parameter error says nothing.",
     )
 
 
-def support(rest: Positions, faces: Faces, views: Views) -> Callable[[Any], Array]:
-    """Which tiles of the views a vertex may change: those near to where it may come to be.
+def support(soft: Soft, faces: Faces, views: Views) -> Callable[[Any], Array]:
+    """Which tiles of the views a vertex may change: those near to where it is seen.
 
-    Smoothed perturbations only fade with the distance, so this is an approximation: about half of
-    what a vertex changes is there.
+    Smoothed perturbations only fade with the distance, so this is an approximation: less than half
+    of what a vertex changes is there.
     """
     tiles = views.size // TILE
     half = views.extent / tiles
-    middles = half * (2 * np.arange(tiles) + 1) - views.extent
-    facing = (
-        np.asarray(vertex_normals(jnp.asarray(rest, jnp.float32), faces)) @ views.frames[:, 2].T
-    )
-    near = np.zeros((len(views.frames), tiles, tiles, len(rest)), bool)
-    for stretch in STRETCH:
-        x, y, _ = np.moveaxis(stretch * rest @ np.swapaxes(views.frames, 1, 2), 2, 0)
-        across, down = (
-            np.maximum(np.abs(at[:, None] - middles[:, None]) - half, 0) for at in (x, y)
+    middles = jnp.asarray(half * (2 * np.arange(tiles) + 1) - views.extent, jnp.float32)
+    frames = jnp.asarray(views.frames, jnp.float32)
+
+    def around(y: dict[str, Array]) -> Callable[[dict[str, Array]], Array]:
+        positions = soft(y["positions"])
+        right, down, _ = jnp.einsum("vin,kn->ivk", frames, positions)
+        facing = jnp.einsum("vn,kn->vk", frames[:, 2], vertex_normals(positions, faces)) < BEHIND
+        across, along = (
+            jnp.maximum(jnp.abs(at[:, None] - middles[:, None]) - half, 0) for at in (right, down)
         )
-        near |= down[:, :, None] ** 2 + across[:, None] ** 2 < REACH**2
-    matrix = (near & (facing.T < BEHIND)[:, None, None]).astype(np.float32)
+        near = along[:, :, None] ** 2 + across[:, None] ** 2 < REACH**2
+        matrix = (near & facing[:, None, None]).astype(positions.dtype)
 
-    def blame(y: Any) -> Float[Array, "views tiles tiles"]:
-        each = sum(jnp.sum(field, axis=1) for field in jax.tree.leaves(y))
-        return jnp.asarray(matrix) @ each
+        def blame(y: dict[str, Array]) -> Float[Array, "views tiles tiles"]:
+            return matrix @ sum(jnp.sum(field, axis=1) for field in y.values())
 
-    return blame
+        return blame
+
+    return sd.moving_support(around)
 
 
 def ball(vertices: int) -> tuple[Positions, Faces]:

@@ -22,6 +22,7 @@ iterates, one step at a time under `smoothdiff.minimise`. What both rely on:
 from smoothdiff._solvers._base import AbstractSmoothSolver, Progress
 from smoothdiff._solvers.first_order import FirstOrder
 from smoothdiff._solvers.gauss_newton import GaussNewton
+from smoothdiff._solvers.local_gauss_newton import LocalGaussNewton
 from smoothdiff._solvers.newton_cg import NewtonCG
 from smoothdiff._solvers.zerograds import ZeroGrads
 
@@ -29,6 +30,7 @@ __all__ = [
     "AbstractSmoothSolver",
     "FirstOrder",
     "GaussNewton",
+    "LocalGaussNewton",
     "NewtonCG",
     "Progress",
     "ZeroGrads",

@@ -77,7 +77,7 @@ def local_steps(
             if the sum of squares falls outwards.
         high: The upper bounds likewise.
     """
-    slopes = _slopes(_centred(points, valid), _centred(residuals, valid), jnp.sum(valid))
+    slopes = _slopes(centred(points, valid), centred(residuals, valid), jnp.sum(valid))
     if low is not None and high is not None:
         gradient = dot(slopes, here)
         held = ((low >= 0) & (gradient > 0)) | ((high <= 0) & (gradient < 0))
@@ -85,7 +85,7 @@ def local_steps(
     return _damped(slopes, here)
 
 
-def _centred(x: Array, valid: Array) -> Array:
+def centred(x: Float[Array, "B M n"], valid: Bool[Array, "B M"]) -> Float[Array, "BM n"]:
     """Seen from the mean of their own batch, as one batch; zeros where not valid."""
     count = jnp.maximum(jnp.sum(valid, axis=1), 1).astype(x.dtype)
     mean = jnp.sum(jnp.where(valid[..., None], x, 0), axis=1) / count[:, None]

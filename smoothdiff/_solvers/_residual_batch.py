@@ -89,3 +89,13 @@ def around(
     """Points around the parameters, within the bounds."""
     draws = Draws(sampler, key, count, params.theta.size, params.theta.dtype, None)
     return draws.map(lambda z, _: jax.vmap(params.clip)(params.theta[None] + sigma[None] * z))
+
+
+def fresh_loss(
+    residuals: Residuals, points: Float[Array, "m n"], nonfinite: str
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The smoothed loss by these points and its standard error; NaN if too few are good."""
+    rows, _ = residuals(points)
+    batch = ResidualBatch.of(points, rows, jnp.asarray(len(points)))
+    fun, stderr = batch.loss()
+    return jnp.where(batch.enough(nonfinite), fun, jnp.nan), stderr

@@ -25,7 +25,7 @@ from smoothdiff._solvers._base import (
 )
 from smoothdiff._solvers._local_steps import TRIED, steps_to_try
 from smoothdiff._solvers._parameter_regression import gauss_newton_step
-from smoothdiff._solvers._residual_batch import ResidualBatch, Residuals, around
+from smoothdiff._solvers._residual_batch import ResidualBatch, Residuals, around, fresh_loss
 from smoothdiff._solvers._residual_history import History
 from smoothdiff._solvers._residual_search import ResidualSearch, next_scale
 from smoothdiff._solvers._restarts import Restarts, check_restarts
@@ -326,10 +326,8 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         def estimate(y):
             params = self._params(y, progress.step, options)
             points = self._points(params, key, params.sigma * scale, count)
-            rows, _ = Residuals(fn, args, params, self.batch_size)(points)
-            batch = ResidualBatch.of(points, rows, jnp.asarray(count))
-            fun, stderr = batch.loss()
-            return jnp.where(batch.enough(self.nonfinite), fun, jnp.nan), stderr
+            residuals = Residuals(fn, args, params, self.batch_size)
+            return fresh_loss(residuals, points, self.nonfinite)
 
         y, fun, stderr = judge(estimate, y, progress.best_y)
         evaluations = progress.evaluations + self.final_evaluations(y)

@@ -1,0 +1,115 @@
+r"""Gauss-Newton steps of many places at once, where it is known which terms a parameter moves.
+
+Samples see all parameters move at the same time. Around a term t few of them matter, so a batch
+that is small beside all parameters is large there. With centred samples u and residuals r, the step
+in the space of M samples, around one term, is that of Levenberg and Marquardt,
+
+$$ w_t = -(G_t + \lambda \tau_t I)^{-1} g_t, \qquad
+   G_t = \sum_s N_{ts} R_s R_s^T, \quad g_t = \sum_s N_{ts} R_s m_s, $$
+
+with $R_s$ (M rows) the residuals of the term s, m their mean, $\tau$ the mean of the diagonal, and
+$N = S S^T$ the number of parameters that two terms share, S being the support: nearby terms have
+more say than those further off. A parameter takes the mean of the steps of its own terms,
+
+$$ \Delta_j = \sum_t S_{tj} \, (w_t \cdot u_j) / \sum_t S_{tj}. $$
+
+So nothing larger than M x M is solved, and steps change as smoothly from place to place as supports
+overlap. To solve once for each parameter instead, by its own terms alone, converges more slowly
+where supports overlap, and takes longer.
+
+Source: own; ensemble Kalman filters are localised like this (Hunt, Kostelich and Szunyogh, 2007),
+and so are their weights averaged (Yang, Kalnay, Hunt and Bowler, 2009).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from smoothdiff._support import AbstractSupport
+
+# of each step, in units of the mean diagonal
+DAMPINGS = (30.0, 10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.01)
+# so many pairs of samples, and so many terms, at a time: a matter of memory
+_PAIRS, _TERMS = 64, 256
+
+
+@dataclass(frozen=True)
+class Blame:
+    """A support as a map between vectors, of n parameters and of the terms."""
+
+    support: AbstractSupport
+    tree: Callable[[Array], PyTree]
+    n: int
+
+    def terms(self, params: Float[Array, " n"]) -> Float[Array, " T"]:
+        """For each term, the sum over the parameters that may influence it."""
+        return self.support(self.tree(params)).ravel()
+
+    def params(self, terms: Float[Array, " T"]) -> Float[Array, " n"]:
+        """For each parameter, the sum over the terms that it may influence."""
+        like = jax.ShapeDtypeStruct((self.n,), terms.dtype)
+        return jax.linear_transpose(self.terms, like)(terms)[0]
+
+
+def ensemble_steps(
+    blame: Blame,
+    u: Float[Array, "M n"],
+    residuals: Float[Array, "M T q"],
+    mean: Float[Array, "T q"],
+) -> Float[Array, "dampings n"]:
+    """The steps that lower the mean residuals, from the most to the least damped.
+
+    Args:
+        blame: Which terms a parameter may influence.
+        u: Samples of the parameters, centred; zeros where one does not count.
+        residuals: Those of each term there, centred likewise.
+        mean: What was subtracted from the residuals.
+    """
+    count = len(u)
+    left, right = np.triu_indices(count)
+    own = jnp.maximum(blame.terms(jnp.ones_like(u[0])), 1)
+    around = lambda term: blame.terms(blame.params(term)) / own
+
+    def gram(pair: tuple[Array, Array]) -> Array:
+        return around(jnp.sum(residuals[pair[0]] * residuals[pair[1]], axis=1))
+
+    def side(row: Array) -> Array:
+        return around(jnp.sum(row * mean, axis=1))
+
+    grams = jax.lax.map(gram, (left, right), batch_size=_PAIRS)
+    sides = jax.lax.map(side, residuals, batch_size=_PAIRS)
+
+    def weights(term: tuple[Array, Array]) -> Array:
+        entries, side = term
+        matrix = jnp.zeros((count, count), u.dtype)
+        matrix = matrix.at[left, right].set(entries).at[right, left].set(entries)
+        level = jnp.trace(matrix) / count
+        damping = jnp.asarray(DAMPINGS, u.dtype) * jnp.where(level > 0, level, 1)
+        solve = lambda d: jax.scipy.linalg.solve(
+            matrix + d * jnp.eye(count, dtype=u.dtype), side, assume_a="pos"
+        )
+        return jax.vmap(solve)(damping)
+
+    found = jax.lax.map(weights, (grams.T, sides.T), batch_size=_TERMS)
+
+    def add(total: Array, sample: tuple[Array, Array]) -> tuple[Array, None]:
+        weight, one = sample
+        return total + jax.vmap(blame.params)(weight) * one[None], None
+
+    total = jnp.zeros((len(DAMPINGS), u.shape[1]), u.dtype)
+    total, _ = jax.lax.scan(add, total, (jnp.transpose(found, (2, 1, 0)), u))
+    return -total / jnp.maximum(blame.params(jnp.ones_like(mean[:, 0])), 1)[None]
+
+
+def best_of_each_place(
+    blame: Blame, ends: Float[Array, "K n"], losses: Float[Array, "K T"]
+) -> Float[Array, " n"]:
+    """Each parameter from the end that is best in the terms that it may influence."""
+    worst = jnp.max(jnp.where(jnp.isfinite(losses), losses, 0))
+    losses = jnp.where(jnp.isfinite(losses), losses, 2 * worst + 1)
+    chosen = jnp.argmin(jax.vmap(blame.params)(losses), axis=0)
+    return jnp.take_along_axis(ends, chosen[None], axis=0)[0]

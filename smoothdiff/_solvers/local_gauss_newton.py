@@ -1,0 +1,289 @@
+"""Gauss-Newton in all places at once, where each parameter moves only some of the residuals."""
+
+from collections.abc import Callable
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from smoothdiff._params import Params, take_apart
+from smoothdiff._samplers import AbstractSampler, Gaussian
+from smoothdiff._solvers._base import (
+    AbstractSmoothSolver,
+    Progress,
+    all_finite,
+    judge,
+    promotion,
+    read_options,
+    sigma_at,
+    stopped,
+    unless_failed,
+)
+from smoothdiff._solvers._local_ensemble import (
+    DAMPINGS,
+    Blame,
+    best_of_each_place,
+    ensemble_steps,
+)
+from smoothdiff._solvers._local_steps import centred
+from smoothdiff._solvers._residual_batch import ResidualBatch, Residuals, around, fresh_loss
+from smoothdiff._support import AbstractSupport, as_support
+
+# ends that are evaluated in a step: one for each damping, and the best of each place
+_TRIED = len(DAMPINGS) + 1
+# samples in a step, and what limits them: the cubes of their number, one for each term
+_FEWEST, _MOST = 16, 96 - _TRIED
+_CUBES = 5e8
+# sigma falls while the samples' sum of squares is more than so many times that of the iterate
+_NOISE = 2.0
+_SHRINK, _GROW = 0.9, 1.05
+# so many small steps in a row count as convergence
+_SMALL = 3
+
+
+class LocalGaussNewtonState(eqx.Module):
+    """The state of `LocalGaussNewton`: `scale` is the width relative to sigma."""
+
+    progress: Progress
+    scale: Float[Array, ""]
+    small: Int[Array, ""]
+
+
+class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
+    r"""Nonlinear least squares with local support: thousands of parameters from small batches.
+
+    $$ w_t = -(G_t + \lambda \tau_t I)^{-1} g_t, \qquad
+       y_j \leftarrow y_j + \sigma \operatorname{mean}_{t \ni j} (w_t \cdot u_j), \qquad
+       G_t = \sum_s N_{ts} R_s R_s^T, \quad g_t = \sum_s N_{ts} R_s m_s $$
+
+    The residuals are an array of terms, such as the pixels of a picture or its tiles, and `support`
+    says which of them a parameter may move. Around a term there are few parameters that matter, so
+    a batch M that is small beside all n of them is large there: each term t solves the problem of
+    its neighbourhood in the space of the samples u (M x M numbers), and a parameter takes the mean
+    of what its terms say. R are the residuals of the samples minus their mean m, $N = S S^T$ says
+    how many parameters two terms share, and $\tau$ is the mean of the diagonal of G.
+
+    The step is tried with eight dampings $\lambda$, from 30 to 0.01. Then each parameter takes what
+    was best in its own terms, which is tried too, and the best of all nine is the next iterate. So
+    a step may be far from damped in one place and short in another. It is taken even where the
+    iterate was better, as a single point of a rough function is a matter of luck; the point of
+    lowest smoothed loss is kept, and judged at the end.
+
+    `GaussNewton` needs no support, but a time and a memory that grow with the number of parameters
+    times that of residuals. Here M^2 numbers are kept for each term.
+
+    Args:
+        sigma: the smoothing width in the units of the parameters, positive for each of them. A
+            number or a pytree like the parameters adapts: it falls by a tenth in a step as long as
+            the samples' mean sum of squares is more than twice that of the next iterate, and else
+            grows again, so that noise in the residuals keeps it up. While all samples are the same
+            it doubles. An optax schedule is taken as it is.
+        support: which terms a parameter may influence, as for `smooth`: `local_support`,
+            `matrix_support`, `moving_support` or any linear function from parameter-shaped to
+            term-shaped arrays with entries 0 and 1. The residuals are one array with the shape of
+            the terms; further axes, such as colours, belong to their term.
+        num_samples: evaluations a step, at least 12, nine of which are the ends that are tried. By
+            default up to 96: about n / 2 samples, between 16 and 87, and fewer for more than about
+            a thousand terms, so that a step takes seconds at most (for 65,536 terms 28).
+        sampler: where to sample.
+        batch_size: evaluate at most so many samples at a time, as for `smooth`.
+        nonfinite: "propagate" or "drop" samples with a NaN or an infinity in their residuals; as
+            long as half of a batch are finite. The ends that are tried may be anything.
+        rtol: relative tolerance. The run has converged when three steps in a row and their sigma
+            are below `atol + rtol * norm(y)`.
+        atol: absolute tolerance. By default both are zero, and the run uses up its budget.
+        norm: the norm of steps and iterates.
+
+    Raises:
+        ValueError: fewer than 12 evaluations a step, another word for `nonfinite`; and, when it
+            runs, a leaf without a sigma, a support that does not go with the residuals.
+        TypeError: a support that is no function; residuals that are no real floating-point numbers.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, smoothdiff as sd
+        >>> hidden = jax.random.uniform(jax.random.key(1), (16, 16))
+        >>> blur = lambda x: (x + jnp.roll(x, 1, 0) + jnp.roll(x, 1, 1)) / 3
+        >>> picture = lambda x: jnp.round(32 * blur(x)) / 32
+        >>> result = sd.least_squares(
+        ...     lambda x, photo: picture(x) - photo,
+        ...     jnp.full((16, 16), 0.5),
+        ...     picture(hidden),
+        ...     key=jax.random.key(0),
+        ...     solver=sd.LocalGaussNewton(0.1, sd.local_support(1)),
+        ...     max_evaluations=1500,
+        ... )
+        >>> bool(jnp.mean(jnp.abs(picture(result.y) - picture(hidden))) < 1 / 32)
+        True
+
+    Source: own; see `_local_ensemble.py` for what it takes from ensemble Kalman filters (Hunt,
+    Kostelich and Szunyogh, 2007).
+    """
+
+    sigma: PyTree
+    support: AbstractSupport
+    num_samples: int | None
+    sampler: AbstractSampler
+    batch_size: int | None
+    nonfinite: Literal["propagate", "drop"]
+    rtol: float
+    atol: float
+    norm: Callable[[PyTree], Float[Array, ""]]
+
+    def __init__(
+        self,
+        sigma: PyTree,
+        support: Callable[[PyTree], Array],
+        *,
+        num_samples: int | None = None,
+        sampler: AbstractSampler = Gaussian(),  # noqa: B008 (a frozen module)
+        batch_size: int | None = None,
+        nonfinite: Literal["propagate", "drop"] = "propagate",
+        rtol: float = 0.0,
+        atol: float = 0.0,
+        norm: Callable[[PyTree], Float[Array, ""]] = optx.max_norm,
+    ):
+        if num_samples is not None and num_samples < _TRIED + 3:
+            raise ValueError(
+                f"num_samples={num_samples}: a step needs at least {_TRIED + 3} evaluations, "
+                f"as {_TRIED} of them are ends of steps that are tried"
+            )
+        if nonfinite not in ("propagate", "drop"):
+            raise ValueError(f'nonfinite must be "propagate" or "drop", not {nonfinite!r}')
+        blame = as_support(support)
+        if blame is None:
+            raise TypeError("LocalGaussNewton needs a support; GaussNewton does without one")
+        self.sigma = sigma
+        self.support = blame
+        self.num_samples = num_samples
+        self.sampler = sampler
+        self.batch_size = batch_size
+        self.nonfinite = nonfinite
+        self.rtol = rtol
+        self.atol = atol
+        self.norm = norm
+
+    def evaluations_per_step(self, y: PyTree[Array]) -> int:
+        """One batch, and the ends that are tried."""
+        return self._samples(y) + _TRIED
+
+    def final_evaluations(self, y: PyTree[Array]) -> int:
+        """A batch for each of the two candidates."""
+        return 2 * self._samples(y)
+
+    def _samples(self, y: PyTree[Array]) -> int:
+        """Evaluations of a batch."""
+        if self.num_samples is not None:
+            return self.num_samples - _TRIED
+        n = sum(leaf.size for leaf in jax.tree.leaves(y))
+        terms = jax.eval_shape(self.support.at(y), y).size
+        affordable = int((_CUBES / max(terms, 1)) ** (1 / 3))
+        return max(_FEWEST, min(n // 2, _MOST, affordable))
+
+    def _params(self, y: PyTree, step: Int[Array, ""], options: dict) -> Params:
+        params = take_apart(y, sigma_at(self.sigma, step), read_options(options)[1])
+        if params.free:
+            raise ValueError(
+                "LocalGaussNewton needs a sigma for every leaf of the parameters, not None"
+            )
+        return params
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> LocalGaussNewtonState:
+        """Checks what can be looked at; evaluates nothing."""
+        params = self._params(y, jnp.asarray(0, jnp.int32), options)
+        terms = jax.eval_shape(self.support.at(y), y)
+        leaves = jax.tree.leaves(f_struct)
+        if len(leaves) != 1 or leaves[0].shape[: len(terms.shape)] != terms.shape:
+            shapes = [leaf.shape for leaf in leaves]
+            raise ValueError(
+                f"the support maps the parameters to terms of shape {terms.shape}, but the "
+                f"residuals have shape {shapes[0] if len(shapes) == 1 else shapes}: return one "
+                "array whose first axes are those of the terms"
+            )
+        if not jnp.issubdtype(leaves[0].dtype, jnp.floating):
+            raise TypeError(
+                f"the residuals have dtype {leaves[0].dtype}; they must be real floating-point "
+                "numbers: use .astype(float)"
+            )
+        dtype = params.theta.dtype
+        one, none = jnp.ones((), dtype), jnp.zeros((), jnp.int32)
+        return LocalGaussNewtonState(Progress.start(y, dtype), one, none)
+
+    def step(self, fn, y, args, options, state, tags):
+        """One batch, one step in each place, the best of nine ends."""
+        progress = state.progress
+        params = self._params(y, progress.step, options)
+        residuals = Residuals(fn, args, params, self.batch_size)
+        blame = Blame(self.support.at(y), params.layout.tree, params.theta.size)
+        key = jax.random.fold_in(read_options(options)[0], progress.step)
+        sigma = params.sigma * state.scale
+
+        points = around(params, self.sampler, key, sigma, self._samples(y))
+        rows, aux = residuals(points)
+        batch = ResidualBatch.of(points, rows, jnp.asarray(len(points)))
+        theta, lowest = _next(residuals, blame, batch, sigma)
+
+        fun, stderr = batch.loss()
+        scale = state.scale
+        if not callable(self.sigma):
+            # of a function without any noise, the samples are as good as the iterate on a plateau
+            still = jnp.where(scale < 1, jnp.minimum(_GROW * scale, 1), scale)
+            scale = jnp.where(fun > _NOISE * lowest, _SHRINK * scale, still)
+            scale = jnp.where(batch.same(), 2 * state.scale, scale)
+        new_y = params.layout.tree(theta)
+        with promotion():
+            moved = self.norm(params.layout.tree(jnp.abs(theta - params.theta) + sigma))
+            small = jnp.where(moved < self.atol + self.rtol * self.norm(y), state.small + 1, 0)
+        finite = batch.enough(self.nonfinite) & all_finite((fun, theta, scale, lowest))
+        new_y, scale = unless_failed(finite, (new_y, scale), (y, state.scale))
+        progress = progress.after(y, fun, stderr, sigma, len(points) + _TRIED, finite)
+        return new_y, LocalGaussNewtonState(progress, scale, small), aux
+
+    def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
+        """After small steps in a row, or a failed one."""
+        return stopped(state.progress, state.small >= _SMALL)
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        """Judges the last iterate and the best recorded on the next step's samples."""
+        progress = state.progress
+        key = jax.random.fold_in(read_options(options)[0], progress.step)
+
+        def estimate(y):
+            params = self._params(y, progress.step, options)
+            sigma = params.sigma * state.scale
+            points = around(params, self.sampler, key, sigma, self._samples(y))
+            residuals = Residuals(fn, args, params, self.batch_size)
+            return fresh_loss(residuals, points, self.nonfinite)
+
+        y, fun, stderr = judge(estimate, y, progress.best_y)
+        evaluations = progress.evaluations + self.final_evaluations(y)
+        return y, aux, {"fun": fun, "stderr": stderr, "evaluations": evaluations}
+
+
+def _next(
+    residuals: Residuals, blame: Blame, batch: ResidualBatch, sigma: Float[Array, " n"]
+) -> tuple[Float[Array, " n"], Float[Array, ""]]:
+    """The best of the ends of the steps that a batch suggests, and half the sum of squares there.
+
+    That is infinite where no end is finite.
+    """
+    params = residuals.params
+    terms = blame.terms(params.theta).size
+    by_term = lambda rows: rows.reshape(-1, terms, rows.shape[1] // terms)
+    good = batch.good[None]
+    u = centred(batch.points[None] / sigma, good)
+    rows = centred(batch.rows[None], good)
+    count = jnp.maximum(jnp.sum(batch.good), 1).astype(rows.dtype)
+    mean = jnp.sum(batch.rows, axis=0) / count
+
+    steps = ensemble_steps(blame, u, by_term(rows), by_term(mean[None])[0])
+    ends = jax.vmap(params.clip)(params.theta[None] + sigma[None] * steps)
+    there = jnp.sum(by_term(residuals(ends)[0]) ** 2, axis=2)
+    mixed = best_of_each_place(blame, ends, there)[None]
+    last = jnp.sum(by_term(residuals(mixed)[0]) ** 2, axis=2)
+    losses = jnp.sum(jnp.concatenate([there, last]), axis=1) / 2
+    losses = jnp.where(jnp.isfinite(losses), losses, jnp.inf)
+    best = jnp.argmin(losses)
+    return jnp.concatenate([ends, mixed])[best], losses[best]
