@@ -86,9 +86,14 @@ def local_steps(
 
 
 def centred(x: Float[Array, "B M n"], valid: Bool[Array, "B M"]) -> Float[Array, "BM n"]:
-    """Seen from the mean of their own batch, as one batch; zeros where not valid."""
+    """Seen from the mean of their own batch, as one batch; zeros where not valid.
+
+    By way of a valid row, so that columns that are the same in all rows become exact zeros.
+    """
+    first = jnp.take_along_axis(x, jnp.argmax(valid, axis=1)[:, None, None], axis=1)
+    x = jnp.where(valid[..., None], x - first, 0)
     count = jnp.maximum(jnp.sum(valid, axis=1), 1).astype(x.dtype)
-    mean = jnp.sum(jnp.where(valid[..., None], x, 0), axis=1) / count[:, None]
+    mean = jnp.sum(x, axis=1) / count[:, None]
     return jnp.where(valid[..., None], x - mean[:, None], 0).reshape(-1, x.shape[-1])
 
 
