@@ -137,6 +137,7 @@ def stairs(evaluations: int) -> Task:
         budget=Budget(evaluations, 60),
         seeds=1,
         terms=terms,
+        residuals=lambda y: jnp.sqrt(terms(y)),
         support=vector,
     )
 
@@ -148,6 +149,7 @@ def stairs(evaluations: int) -> Task:
         ("local_gradient", 480, 0.02, 8),
         ("local_first_order", 480, 0.2, 8),
         ("cma_es_diagonal", 2000, 0.2, 18),
+        ("local_gauss_newton", 480, 0.02, 72),
     ],
 )
 def test_many_parameters(name, evaluations, left, batch):
@@ -164,7 +166,11 @@ def test_many_parameters(name, evaluations, left, batch):
 
 
 @pytest.mark.parametrize(
-    "name", ["local_cross_entropy", "local_gradient", "local_first_order", "cma_es_diagonal"]
+    "name",
+    [
+        *("local_cross_entropy", "local_gradient", "local_first_order", "local_gauss_newton"),
+        "cma_es_diagonal",
+    ],
 )
 def test_methods_for_many_parameters_say_what_they_need(name):
     with pytest.raises(NotAble, match=r"parameters or more|local support"):

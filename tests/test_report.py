@@ -108,6 +108,7 @@ def scene(name="shadow", dimensions=2, **found):
         (2, {"newton_cg": 2, "gauss_newton": 3}, "gauss_newton"),
         (2, {"newton_cg": 2, "gauss_newton": "no residuals", "fr22": 1}, "newton_cg"),
         (FEW + 1, {"gauss_newton": 2, "local_first_order": 1}, "gauss_newton"),
+        (FEW + 1, {"gauss_newton": 2, "local_gauss_newton": 3}, "local_gauss_newton"),
         (FEW + 1, {"newton_cg": 1, "local_first_order": 9}, "local_first_order"),
         (FEW + 1, {"newton_cg": 1, "first_order": 3}, "first_order"),
         (2, {"fr22": 2}, None),

@@ -305,6 +305,39 @@ def test_a_full_support_is_none_at_all():
     assert_same(*run(), scale=10)
 
 
+def test_a_support_that_moves_is_asked_where_the_parameters_are():
+    """Left of zero a parameter has its own term, right of it the neighbours' too."""
+
+    def around(x):
+        left = (x < 0).astype(x.dtype)
+        return lambda p: jnp.eye(N) @ (left * p) + SUPPORT((1 - left) * p)
+
+    left = (THETA < 0).astype(THETA.dtype)
+    matrix = jnp.where(left[None] > 0, jnp.eye(N), matrix_of(SUPPORT, (N,)))
+
+    @jax.jit
+    def run():
+        make = lambda support: sd.smooth_hvp(terms, SIGMA, num_samples=64, support=support)
+        options: dict[str, Any] = {"num_samples": 64, "sampler": sd.Gaussian(), "baseline": "mean"}
+        moving = sd.moving_support(around)
+        gradient = [
+            sd.smooth_grad(terms, SIGMA, support=s, **options)(KEY, THETA)
+            for s in (moving, around(THETA), sd.matrix_support(np.asarray(matrix)))
+        ]
+        product = [make(s)(KEY, THETA, V) for s in (moving, around(THETA))]
+        return gradient, product
+
+    (moving, still, known), product = run()
+    assert_same(moving, still)
+    assert_same(moving, known)
+    assert_same(*product)
+
+
+def test_a_moving_support_alone_is_nowhere():
+    with pytest.raises(ValueError, match=r"support\.at"):
+        sd.moving_support(lambda x: lambda p: p)(THETA)
+
+
 # ---------------------------------------------------------------------------------------------
 # bad input
 
@@ -349,3 +382,5 @@ def test_helpers_with_numbers_out_of_range():
         sd.local_support(-1)
     with pytest.raises(ValueError, match="ndim"):
         sd.local_support(1, ndim=0)
+    with pytest.raises(TypeError, match="around"):
+        sd.moving_support(SUPPORT(THETA))  # pyright: ignore[reportArgumentType]

@@ -101,6 +101,7 @@ MANY_PARAMETERS = (
     "local_first_order",
     "local_cross_entropy",
     "gauss_newton",
+    "local_gauss_newton",
 )
 # and what takes more for each step, or more memory than a vector, the more parameters there are
 PROGRAMS = ("finite_differences", "cma_es", *MANY_PARAMETERS, "newton_cg")

@@ -10,7 +10,7 @@ from benchmarks.scenes._dearer import SAVINGS
 
 # of ours, by what they know of the loss
 FIRST = ("first_order", "local_gradient", "local_first_order")
-SECOND = ("newton_cg", "gauss_newton")
+SECOND = ("newton_cg", "gauss_newton", "local_gauss_newton")
 
 
 def table(results: dict[str, Any], scenes: Sequence[Scene]) -> Grid:

@@ -12,7 +12,7 @@ from benchmarks.scenes import meshes, soft_mesh
 TITLE = "Banana: 16,422 coordinates and colours of a mesh"
 METHODS = (
     *("spsa", "fr22", "first_order", "zerograds"),
-    *("local_gradient", "local_first_order", "gauss_newton"),
+    *("local_gradient", "local_first_order", "gauss_newton", "local_gauss_newton"),
 )
 VERTICES = 2737
 REST = (0.4, 0.4, 0.85)  # half axes of the ellipsoid

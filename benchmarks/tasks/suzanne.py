@@ -12,7 +12,7 @@ from benchmarks.scenes import meshes, soft_mesh
 TITLE = "Suzanne: 7,686 coordinates of a mesh"
 METHODS = (
     *("spsa", "fr22", "first_order", "zerograds"),
-    *("local_gradient", "local_first_order", "gauss_newton"),
+    *("local_gradient", "local_first_order", "gauss_newton", "local_gauss_newton"),
 )
 REST = 0.8  # radius of the sphere
 SKULL = 0.75

@@ -30,6 +30,7 @@ METHODS = (
     "local_first_order",
     "local_cross_entropy",
     "gauss_newton",
+    "local_gauss_newton",
 )
 SIDE = 32  # texels
 TILT = 30.0  # degrees, of the poster [-1, 1]², whose lower edge is the nearer one

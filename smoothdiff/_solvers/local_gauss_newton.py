@@ -273,7 +273,7 @@ def _next(
     terms = blame.terms(params.theta).size
     by_term = lambda rows: rows.reshape(-1, terms, rows.shape[1] // terms)
     good = batch.good[None]
-    u = centred(batch.points[None] / sigma, good)
+    u = centred(batch.points[None], good) / sigma[None]
     rows = centred(batch.rows[None], good)
     count = jnp.maximum(jnp.sum(batch.good), 1).astype(rows.dtype)
     mean = jnp.sum(batch.rows, axis=0) / count

@@ -82,6 +82,7 @@ def mesh_laplacian(
 
     def filter(signal: Array, guide: Any) -> Array:
         _check_signal(signal, faces)
+        signal = jnp.asarray(signal)
         for _ in range(power):
             signal = solve(signal, guide)
         return signal

@@ -1,0 +1,263 @@
+"""Gauss-Newton with local support: brute force, known optima, counting, bounds, noise, faults."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+import smoothdiff as sd
+from smoothdiff._solvers._local_ensemble import (
+    DAMPINGS,
+    Blame,
+    best_of_each_place,
+    ensemble_steps,
+)
+from smoothdiff._solvers._local_steps import centred
+
+KEY = jax.random.key(3)
+N = 80
+HIDDEN = np.random.default_rng(0).uniform(-1, 1, N)
+SUPPORT = sd.local_support(1, ndim=1)
+SOLVER = sd.LocalGaussNewton(0.3, SUPPORT, num_samples=33)  # compiled once for all tests of `off`
+
+
+def blurred(y):
+    """Each term sees a parameter and its neighbours; two residuals for a term."""
+    padded = jnp.pad(y, 1)
+    near = (padded[:-2] + 2 * padded[1:-1] + padded[2:]) / 4
+    return jnp.stack([near, 0.5 * padded[1:-1]], axis=-1)
+
+
+def steps(y, fineness=20):
+    """The same, in steps: no derivative says anything."""
+    return jnp.round(fineness * blurred(y)) / fineness
+
+
+def fit(fun, y0=None, **options):
+    options = {"key": KEY, "max_evaluations": 800, "solver": SOLVER} | options
+    y0 = jnp.zeros(N) if y0 is None else y0
+    return sd.least_squares(fun, y0, **options)
+
+
+def off(y, args=None):
+    return blurred(y) - blurred(jnp.asarray(HIDDEN, y.dtype))
+
+
+def off_in_steps(y, args=None):
+    return steps(y) - steps(jnp.asarray(HIDDEN, y.dtype))
+
+
+def squares(y, fun=off):
+    return float(jnp.sum(fun(y) ** 2))
+
+
+# ---------------------------------------------------------------------------------------------
+# the step
+
+
+def test_steps_are_those_of_the_formula(x64):
+    rng = np.random.default_rng(1)
+    matrix = (rng.random((5, 7)) < 0.5).astype(float)
+    matrix[:, 6] = 0  # a parameter that moves nothing
+    matrix[4] = 0  # a term that nothing moves
+    u, rows, mean = rng.normal(size=(6, 7)), rng.normal(size=(6, 5, 2)), rng.normal(size=(5, 2))
+    blame = Blame(sd.matrix_support(matrix), lambda x: x, 7)
+    found = ensemble_steps(blame, jnp.asarray(u), jnp.asarray(rows), jnp.asarray(mean))
+    shared = matrix @ matrix.T
+    for damping, step in zip(DAMPINGS, found, strict=True):
+        weights = np.zeros((5, 6))
+        for t, own in enumerate(matrix.sum(axis=1)):
+            near = shared[t] / max(own, 1)
+            gram = np.einsum("s,asq,bsq->ab", near, rows, rows)
+            side = np.einsum("s,asq,sq->a", near, rows, mean)
+            level = np.trace(gram) / 6
+            if level > 0:
+                weights[t] = -np.linalg.solve(gram + damping * level * np.eye(6), side)
+        count = np.maximum(matrix.sum(axis=0), 1)
+        expected = np.einsum("tj,ta,aj->j", matrix, weights, u) / count
+        np.testing.assert_allclose(step, expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(found[:, 6], 0)
+
+
+def test_a_small_batch_solves_many_local_problems_at_once(x64):
+    """Each parameter moves its own term alone: 40 samples solve all eighty to the damping."""
+    rng = np.random.default_rng(2)
+    slopes, here = rng.uniform(0.5, 2, N), rng.normal(size=N)
+    u = rng.normal(size=(40, N))
+    u -= u.mean(axis=0)
+    blame = Blame(sd.local_support(0, ndim=1), lambda x: x, N)
+    rows = jnp.asarray((u * slopes)[..., None])
+    last = ensemble_steps(blame, jnp.asarray(u), rows, jnp.asarray(here[:, None]))[-1]
+    left = np.asarray(here + slopes * last)
+    assert np.max(np.abs(left) / np.abs(here)) < 0.01
+
+
+def test_the_best_of_each_place():
+    blame = Blame(sd.local_support(0, ndim=1), lambda x: x, 3)
+    ends = jnp.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0], [7.0, 8.0, 9.0]])
+    losses = jnp.array([[1.0, 2.0, jnp.nan], [2.0, 1.0, 7.0], [jnp.inf, 3.0, 8.0]])
+    np.testing.assert_array_equal(best_of_each_place(blame, ends, losses), [1.0, 5.0, 6.0])
+
+
+def test_what_is_the_same_in_all_samples_is_an_exact_zero(dtype):
+    x = jnp.full((1, 51, 3), 1 / 3, dtype).at[0, 0].set(jnp.nan)
+    valid = jnp.ones((1, 51), bool).at[0, 0].set(False)
+    np.testing.assert_array_equal(centred(x, valid), 0)
+
+
+# ---------------------------------------------------------------------------------------------
+# runs
+
+
+def test_many_parameters_in_few_evaluations(dtype):
+    y0 = jnp.zeros(N, dtype)
+    result = fit(off, y0)
+    assert result.y.dtype == dtype
+    assert squares(result.y) < 1e-3 * squares(y0)
+
+
+def test_and_where_there_is_no_derivative():
+    result = fit(off_in_steps)
+    assert squares(result.y, off_in_steps) < 0.01 * squares(jnp.zeros(N), off_in_steps)
+
+
+def test_trees_bounds_and_further_axes():
+    """Channels share the support of their cell, and no point outside is ever evaluated."""
+    seen = []
+    target = {"a": jax.random.uniform(jax.random.key(5), (4, 4, 3)), "b": jnp.full((4, 4), 0.4)}
+
+    def fun(y, args):
+        jax.debug.callback(lambda a, b: seen.append((np.min(b), np.max(a))), y["a"], y["b"])
+        return jnp.concatenate([y["a"] - target["a"], (y["b"] - target["b"])[..., None]], axis=-1)
+
+    cells = sd.local_support(0)
+    support = lambda y: cells(jnp.concatenate([y["a"], y["b"][..., None]], axis=-1))
+    y0 = {"a": jnp.full((4, 4, 3), 0.5), "b": jnp.full((4, 4), 0.9)}
+    result = sd.least_squares(
+        fun,
+        y0,
+        key=KEY,
+        solver=sd.LocalGaussNewton({"a": 0.3, "b": 0.5}, support, batch_size=7),
+        bounds=({"a": None, "b": 0.4}, {"a": 0.8, "b": None}),
+        max_evaluations=600,
+    )
+    jax.effects_barrier()
+    lowest, highest = np.min(np.array(seen), axis=0)[0], np.max(np.array(seen), axis=0)[1]
+    assert lowest >= np.float32(0.4)
+    assert highest <= np.float32(0.8)
+    np.testing.assert_allclose(result.y["b"], 0.4, atol=0.05)
+    np.testing.assert_allclose(result.y["a"], jnp.minimum(target["a"], 0.8), atol=0.05)
+
+
+def test_a_support_that_moves():
+    pixels = jnp.arange(100.0)
+    begin = jnp.arange(5.0) * 20 + 4
+    goal = begin + 6 + jnp.sin(jnp.arange(5.0))
+    draw = lambda y: jnp.exp(-((pixels[:, None] - y[None]) ** 2) / 18).sum(axis=1)
+    near = lambda y: (jnp.abs(pixels[:, None] - y[None]) < 8).astype(y.dtype)
+    support = sd.moving_support(lambda y: lambda params: near(y) @ params)
+    result = sd.least_squares(
+        lambda y, args: draw(y) - draw(goal),
+        begin,
+        key=KEY,
+        solver=sd.LocalGaussNewton(2.0, support),
+        max_evaluations=800,
+    )
+    np.testing.assert_allclose(result.y, goal, atol=0.05)
+
+
+def test_evaluations_are_counted():
+    seen = []
+
+    def fun(y, args):
+        jax.debug.callback(lambda one: seen.append(one), y[0])
+        return off(y)
+
+    result = fit(fun, max_evaluations=200)
+    jax.effects_barrier()
+    assert result.evaluations == len(seen) <= 200
+
+
+@pytest.mark.parametrize(("n", "evaluations"), [(20, 25), (100, 59), (500, 96), (256**2, 28)])
+def test_evaluations_per_step(n, evaluations):
+    solver = sd.LocalGaussNewton(0.3, lambda y: y)
+    assert solver.evaluations_per_step(jnp.zeros(n)) == evaluations
+
+
+def test_optimistix_makes_the_same_steps_and_they_are_vmapped():
+    @jax.jit
+    @jax.vmap
+    def run(key, y0):
+        found = optx.least_squares(off, SOLVER, y0, options={"key": key}, max_steps=5, throw=False)
+        return found.value
+
+    keys, starts = jax.random.split(KEY, 2), jnp.zeros((2, N)).at[1].set(0.5)
+    found = run(keys, starts)
+    alone = fit(off, starts[1], key=keys[1], max_evaluations=None, max_steps=5)
+    np.testing.assert_allclose(found[1], alone.y, atol=1e-3)
+
+
+def test_sigma_falls_with_the_error_and_not_below_the_noise():
+    def noisy(y, args):
+        bits = jax.lax.bitcast_convert_type(jnp.sum(y) * 1e3, jnp.int32)
+        return off(y) + 0.05 * jax.random.normal(jax.random.key(bits), (N, 2), y.dtype)
+
+    clean, rough = (fit(fun, max_steps=40, max_evaluations=4000) for fun in (off, noisy))
+    assert clean.history[-1].sigma < 0.02
+    assert rough.history[-1].sigma > 0.05
+    # what is left of the parameters' error is what the noise leaves
+    assert squares(rough.y) < 0.01 * squares(jnp.zeros(N))
+
+
+def test_a_plateau_is_left():
+    """Nothing within ten sigma says anything."""
+    level = lambda y, args: jnp.round(y / 6) - 2.0
+    result = fit(level, jnp.zeros(30), solver=sd.LocalGaussNewton(0.1, lambda y: y))
+    assert jnp.sum(level(result.y, None) ** 2) < 0.1 * jnp.sum(level(jnp.zeros(30), None) ** 2)
+
+
+def test_it_says_when_it_has_converged():
+    solver = sd.LocalGaussNewton(0.3, SUPPORT, num_samples=33, atol=0.1)
+    result = fit(off, solver=solver, max_evaluations=4000)
+    assert result.reason == "converged"
+
+
+# ---------------------------------------------------------------------------------------------
+# faults and bad input
+
+
+def test_samples_that_fail():
+    """A tenth of them at first; the answer lies on the good side."""
+
+    def holes(y, args):
+        return jnp.where(y[7] > HIDDEN[7] + 0.4, jnp.nan, off(y))
+
+    y0 = jnp.full(N, HIDDEN[7])
+    drop = sd.LocalGaussNewton(0.3, SUPPORT, num_samples=33, nonfinite="drop")
+    result = fit(holes, y0, solver=drop)
+    assert squares(result.y) < 0.01 * squares(y0)
+    with pytest.raises(sd.MinimiseError, match='nonfinite="drop"') as error:
+        fit(holes, y0)
+    assert jnp.all(jnp.isfinite(error.value.result.y))
+
+
+def test_bad_arguments():
+    with pytest.raises(ValueError, match="at least 12 evaluations"):
+        sd.LocalGaussNewton(0.3, SUPPORT, num_samples=11)
+    with pytest.raises((ValueError, TypeError), match="nonfinite"):
+        sd.LocalGaussNewton(0.3, SUPPORT, nonfinite="ignore")  # pyright: ignore
+    with pytest.raises(TypeError, match="support"):
+        sd.LocalGaussNewton(0.3, None)  # pyright: ignore
+    with pytest.raises(TypeError, match="support"):
+        sd.LocalGaussNewton(0.3, 3)  # pyright: ignore
+    with pytest.raises(ValueError, match="first axes are those of the terms"):
+        fit(lambda y, args: off(y)[:-1])
+    with pytest.raises(ValueError, match="one array"):
+        fit(lambda y, args: (off(y), off(y)))
+    with pytest.raises(ValueError, match="every leaf"):
+        fit(
+            lambda y, args: off(y["a"]) * y["b"],
+            {"a": jnp.zeros(N), "b": jnp.ones(())},
+            solver=sd.LocalGaussNewton({"a": 0.3, "b": None}, lambda y: SUPPORT(y["a"])),
+        )
