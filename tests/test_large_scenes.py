@@ -14,6 +14,7 @@ from benchmarks._task import Budget, Grey, NotAble, Task
 from benchmarks.methods import grey_box, grey_gauss_newton
 from benchmarks.scenes import mesh_renderer, meshes, soft_mesh
 from benchmarks.tasks import caustic, suzanne, texture32
+from smoothdiff._support import as_support
 
 SIZES = {"texture32": 1024, "caustic": 1024, "suzanne": 7686, "cnn": 267_745}
 BUILT: dict[str, Task] = {}
@@ -72,22 +73,29 @@ def test_a_texel_changes_only_its_support():
     assert 0.1 < texture32.texture().min() < texture32.texture().max() < 0.9
 
 
-def test_half_of_what_a_vertex_changes_is_in_its_support():
+@pytest.mark.parametrize("moved", [False, True])
+def test_where_a_vertex_is_seen_it_changes_most(moved):
+    """Two fifths of it in 3 % of the tiles, before and after the body has moved."""
     found = built("suzanne")
-    terms, support = found.terms, found.support
+    terms, support = found.terms, as_support(found.support)
     assert terms is not None
     assert support is not None
     terms, y = jax.jit(terms), found.start(0)
+    if moved:
+        y = {"positions": y["positions"] + found.reference["positions"]}
+    around = jax.jit(lambda params: support.at(y)(params))
     before = terms(y)
-    within = total = 0.0
+    within, total, share = 0.0, 0.0, []
     for vertex in range(5, 2562, 400):
         one = jnp.zeros((2562, 3)).at[vertex].set(1)
-        may = np.asarray(support({"positions": one})) > 0
-        moved = {"positions": y["positions"] + 5 * found.sigma * one}
-        change = np.abs(np.asarray(terms(moved) - before))
+        may = np.asarray(around({"positions": one})) > 0
+        change = np.abs(
+            np.asarray(terms({"positions": y["positions"] + 5 * found.sigma * one}) - before)
+        )
         within, total = within + change[may].sum(), total + change.sum()
-        assert may.mean() < 0.15
-    assert within > 0.4 * total
+        share.append(may.mean())
+    assert max(share) < 0.04
+    assert within > 0.3 * total
 
 
 def test_coordinates_of_a_mesh_give_the_mesh(key):

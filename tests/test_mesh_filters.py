@@ -310,13 +310,3 @@ def test_signals_and_guides_of_the_wrong_shape_are_refused():
         smooth(jnp.zeros((3, 1)), jnp.zeros((3, 2)))
     with pytest.raises(ValueError, match="positions"):
         mesh_laplacian([[0, 1, 2]], 1.0, weights="cotangent")(jnp.zeros((3, 1)), None)
-
-
-def test_numpy_arrays_are_taken():
-    positions, faces = MESHES["apart"]
-    signal = noise(positions).astype(np.float32)
-    smooth = mesh_laplacian(faces, LAM)
-    np.testing.assert_array_equal(
-        smooth(signal, None),  # pyright: ignore[reportArgumentType]
-        smooth(jnp.asarray(signal), None),
-    )

@@ -149,7 +149,6 @@ def stairs(evaluations: int) -> Task:
         ("local_gradient", 480, 0.02, 8),
         ("local_first_order", 480, 0.2, 8),
         ("cma_es_diagonal", 2000, 0.2, 18),
-        ("local_gauss_newton", 480, 0.02, 72),
     ],
 )
 def test_many_parameters(name, evaluations, left, batch):
@@ -163,6 +162,14 @@ def test_many_parameters(name, evaluations, left, batch):
     assert evaluations <= run["evaluations"][-1] < evaluations + batch
     found = np.asarray(run["found"])
     assert np.all((found >= 0) & (found <= 1))
+
+
+def test_local_gauss_newton():
+    task = stairs(480)
+    solve = methods.load("local_gauss_newton").prepare(task)
+    run = _harness._solve(task, solve, 0, _harness.Counter(), task.exact_loss)
+    assert run["ended"] == "by the method"
+    assert run["image_error"][-1] <= 0.2
 
 
 @pytest.mark.parametrize(

@@ -126,8 +126,8 @@ def mesh_task(
 def support(soft: Soft, faces: Faces, views: Views) -> Callable[[Any], Array]:
     """Which tiles of the views a vertex may change: those near to where it is seen.
 
-    Smoothed perturbations only fade with the distance, so this is an approximation: less than half
-    of what a vertex changes is there.
+    Smoothed perturbations only fade with the distance, so this is an approximation: about two
+    fifths of what a vertex changes are there.
     """
     tiles = views.size // TILE
     half = views.extent / tiles
@@ -139,7 +139,8 @@ def support(soft: Soft, faces: Faces, views: Views) -> Callable[[Any], Array]:
         right, down, _ = jnp.einsum("vin,kn->ivk", frames, positions)
         facing = jnp.einsum("vn,kn->vk", frames[:, 2], vertex_normals(positions, faces)) < BEHIND
         across, along = (
-            jnp.maximum(jnp.abs(at[:, None] - middles[:, None]) - half, 0) for at in (right, down)
+            jnp.maximum(jnp.abs(at[:, None] - middles[None, :, None]) - half, 0)
+            for at in (right, down)
         )
         near = along[:, :, None] ** 2 + across[:, None] ** 2 < REACH**2
         matrix = (near & facing[:, None, None]).astype(positions.dtype)

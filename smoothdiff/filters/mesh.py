@@ -82,7 +82,6 @@ def mesh_laplacian(
 
     def filter(signal: Array, guide: Any) -> Array:
         _check_signal(signal, faces)
-        signal = jnp.asarray(signal)
         for _ in range(power):
             signal = solve(signal, guide)
         return signal
