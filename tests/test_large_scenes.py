@@ -98,6 +98,24 @@ def test_where_a_vertex_is_seen_it_changes_most(moved):
     assert within > 0.3 * total
 
 
+@pytest.mark.parametrize("at", ["start", "reference"])
+def test_light_falls_where_the_support_of_the_caustic_says(at):
+    found = built("caustic")
+    y = found.start(0) if at == "start" else found.reference
+    assert found.terms is not None
+    terms, blame = jax.jit(found.terms), as_support(found.support)
+    assert blame is not None
+    before, blame = terms(y), blame.at(y)
+    within = total = 0.0
+    for place in range(40, 1000, 97):
+        one = jnp.zeros(1024).at[place].set(1).reshape(32, 32)
+        change = np.abs(np.asarray(terms(y + 4 * found.sigma * one) - before))
+        may = np.asarray(blame(one)) > 0
+        within, total = within + change[may].sum(), total + change.sum()
+        assert may.mean() < 0.02
+    assert within > 0.9 * total
+
+
 def test_coordinates_of_a_mesh_give_the_mesh(key):
     directions, faces = meshes.icosphere(2)
     positions = soft_mesh.Soft(0.8 * directions, faces)
@@ -144,7 +162,7 @@ def test_light_goes_straight_down_through_flat_glass_and_is_focused_by_a_ridge()
 def test_light_is_bent_as_snell_says():
     slope = 0.2
     ramp = jnp.tile(jnp.arange(32.0) * slope / caustic.HEIGHT / 29, (32, 1))
-    x, y = np.asarray(caustic.land(ramp, 8))
+    x, y = np.asarray(caustic.land(ramp, (np.arange(8) + 0.5) / 8))
     middles = (np.arange(8) + 0.5) / 8
     angle = np.arctan(slope)
     bend = np.arcsin(caustic.INDEX * np.sin(angle)) - angle

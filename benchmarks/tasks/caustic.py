@@ -4,10 +4,13 @@ After the Caustic task of ZeroGrads (supplement 2.2) and appendix K of higher-or
 rendering. The lower side of the slab is a height field, a cubic B-spline with 32 x 32 coefficients.
 Light comes straight down from afar, is refracted there, and falls on a receiver. A pixel of the
 picture counts the rays that meet it, so the picture is piecewise constant. A coefficient moves the
-light of its surroundings, and to wherever it is sent, so there is no local support.
+light of its surroundings, and to wherever it is sent. Where that is follows from the slab by
+Snell's law, so there is a support that moves with the light.
 
 What is sought is a known slab that draws a face; the paper's is any slab that draws a picture.
 """
+
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -15,15 +18,20 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy import interpolate
 
+import smoothdiff as sd
 from benchmarks._task import Budget, Task
 
 TITLE = "Caustic: 1,024 coefficients of a refracting height field"
-METHODS = ("spsa", "fr22", "cma_es_diagonal", "zerograds", "first_order", "gauss_newton")
+METHODS = (
+    *("spsa", "fr22", "cma_es_diagonal", "zerograds", "first_order", "local_first_order"),
+    *("gauss_newton", "local_gauss_newton"),
+)
 SIDE = 32  # coefficients
 INDEX = 1.33  # of refraction
 DISTANCE = 1.0  # of the receiver, in widths of the slab
 HEIGHT = 0.01  # of a coefficient of 1, likewise
 SIGMA, BOUND = 0.05, 2.0
+REACH = 2.0  # tiles around where the light of a coefficient's place falls
 WIDTH = 0.045  # of the ridges of what is sought, which bring parallel light to a line
 
 
@@ -33,11 +41,17 @@ def build(full: bool) -> Task:
     reference = jnp.asarray(face(), jnp.float32)
     target = jax.jit(lambda y: draw(y, rays, pixels))(reference)
 
-    def residuals(y: Float[Array, "32 32"]) -> Float[Array, "pixels pixels"]:
-        return draw(y, rays, pixels) - target
+    def residuals(y: Float[Array, "32 32"]) -> Float[Array, "32 32 rest"]:
+        """As many tiles as there are coefficients, each with its pixels."""
+        side = pixels // SIDE
+        tiles = (draw(y, rays, pixels) - target).reshape(SIDE, side, SIDE, side)
+        return jnp.swapaxes(tiles, 1, 2).reshape(SIDE, SIDE, -1)
 
     def loss(y: Float[Array, "32 32"]) -> Float[Array, ""]:
         return jnp.mean(residuals(y) ** 2)
+
+    def terms(y: Float[Array, "32 32"]) -> Float[Array, "32 32"]:
+        return jnp.sum(residuals(y) ** 2, axis=-1) / target.size
 
     def start(seed: int) -> Float[Array, "32 32"]:
         return 0.05 * jax.random.normal(jax.random.key(seed), (SIDE, SIDE))
@@ -55,9 +69,20 @@ def build(full: bool) -> Task:
         seeds=10 if full else 2,
         image=lambda y: jnp.repeat(draw(y, rays, pixels)[..., None] / 4, 3, axis=-1),
         residuals=residuals,
+        terms=terms,
+        support=sd.moving_support(around),
         notes=f"{rays} x {rays} rays, {pixels} x {pixels} pixels. A wave that is even over the "
         "slab does not move light: the parameter error says little.",
     )
+
+
+def around(y: Float[Array, "32 32"]) -> Callable[[Float[Array, "32 32"]], Array]:
+    """The tiles, one for each coefficient, near to where the light of its place falls."""
+    places = np.clip((np.arange(SIDE) - 1) / (SIDE - 3), 0, 1)  # the outermost are outside
+    falls = SIDE * land(y, places).reshape(2, 1, -1)
+    tiles = jnp.arange(SIDE, dtype=y.dtype)[None, :, None] + 0.5
+    column, row = (jnp.abs(falls - tiles) < REACH).astype(y.dtype)
+    return lambda params: (row * params.ravel()[None]) @ column.T
 
 
 def draw(y: Float[Array, "32 32"], rays: int, pixels: int) -> Float[Array, "pixels pixels"]:
@@ -65,7 +90,8 @@ def draw(y: Float[Array, "32 32"], rays: int, pixels: int) -> Float[Array, "pixe
 
     @jax.custom_batching.sequential_vmap  # pictures at once take eight times as long
     def one(y: Float[Array, "32 32"]) -> Float[Array, "pixels pixels"]:
-        column, row = jnp.floor(land(y, rays) * pixels).astype(jnp.int32)
+        middles = (np.arange(rays) + 0.5) / rays
+        column, row = jnp.floor(land(y, middles) * pixels).astype(jnp.int32)
         inside = (column >= 0) & (column < pixels) & (row >= 0) & (row < pixels)
         pixel = jnp.where(inside, row * pixels + column, pixels**2)
         count = jnp.zeros(pixels**2, y.dtype).at[pixel.ravel()].add(1, mode="drop")
@@ -74,9 +100,14 @@ def draw(y: Float[Array, "32 32"], rays: int, pixels: int) -> Float[Array, "pixe
     return one(y)
 
 
-def land(y: Float[Array, "32 32"], rays: int) -> Float[Array, "2 rays rays"]:
-    """Where rays meet the receiver, to the right and downwards, in widths of the slab."""
-    value, slope = (jnp.asarray(basis, y.dtype) for basis in _basis(rays))
+def land(
+    y: Float[Array, "32 32"], places: Float[np.ndarray, " rays"]
+) -> Float[Array, "2 rays rays"]:
+    """Where rays from a grid of places on the slab meet the receiver, in widths of the slab.
+
+    To the right and downwards.
+    """
+    value, slope = (jnp.asarray(basis, y.dtype) for basis in _basis(places))
     height = HEIGHT * value @ y @ value.T
     steep = HEIGHT * jnp.stack([value @ y @ slope.T, slope @ y @ value.T])
     # Snell's law for light along (0, 0, 1), from glass into air, and a normal (-slope, 1)
@@ -84,8 +115,8 @@ def land(y: Float[Array, "32 32"], rays: int) -> Float[Array, "2 rays rays"]:
     bent = jnp.sqrt(1 - INDEX**2 * (1 - cosine**2)) - INDEX * cosine
     aside = -(bent * cosine)[None] * steep
     down = INDEX + bent * cosine
-    middles = jnp.asarray((np.arange(rays) + 0.5) / rays, y.dtype)
-    origin = jnp.stack(jnp.meshgrid(middles, middles))
+    along = jnp.asarray(places, y.dtype)
+    origin = jnp.stack(jnp.meshgrid(along, along))
     return origin + aside * ((DISTANCE - height) / down)[None]
 
 
@@ -104,10 +135,9 @@ def face() -> Float[np.ndarray, "32 32"]:
     return focus / HEIGHT * np.exp(-0.5 * (np.min(np.abs(lines), axis=0) / WIDTH) ** 2)
 
 
-def _basis(rays: int) -> tuple[np.ndarray, np.ndarray]:
-    """(rays, 32): the splines, and their slopes, where the rays are."""
+def _basis(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(rays, 32): the splines, and their slopes, at these places."""
     step = 1 / (SIDE - 3)
     knots = step * (np.arange(SIDE + 4) - 3)
     spline = interpolate.BSpline(knots, np.eye(SIDE), 3)
-    middles = (np.arange(rays) + 0.5) / rays
-    return spline(middles), spline.derivative()(middles)
+    return spline(places), spline.derivative()(places)
