@@ -62,7 +62,7 @@ def test_steps_are_those_of_the_formula(x64):
     matrix[:, 6] = 0  # a parameter that moves nothing
     matrix[4] = 0  # a term that nothing moves
     u, rows, mean = rng.normal(size=(6, 7)), rng.normal(size=(6, 5, 2)), rng.normal(size=(5, 2))
-    blame = Blame(sd.matrix_support(matrix), lambda x: x, 7)
+    blame = Blame.of(sd.matrix_support(matrix), lambda x: x, jnp.zeros(7))
     found = ensemble_steps(blame, jnp.asarray(u), jnp.asarray(rows), jnp.asarray(mean))
     shared = matrix @ matrix.T
     for damping, step in zip(DAMPINGS, found, strict=True):
@@ -86,7 +86,7 @@ def test_a_small_batch_solves_many_local_problems_at_once(x64):
     slopes, here = rng.uniform(0.5, 2, N), rng.normal(size=N)
     u = rng.normal(size=(40, N))
     u -= u.mean(axis=0)
-    blame = Blame(sd.local_support(0, ndim=1), lambda x: x, N)
+    blame = Blame.of(sd.local_support(0, ndim=1), lambda x: x, jnp.zeros(N))
     rows = jnp.asarray((u * slopes)[..., None])
     last = ensemble_steps(blame, jnp.asarray(u), rows, jnp.asarray(here[:, None]))[-1]
     left = np.asarray(here + slopes * last)
@@ -94,7 +94,7 @@ def test_a_small_batch_solves_many_local_problems_at_once(x64):
 
 
 def test_the_best_of_each_place():
-    blame = Blame(sd.local_support(0, ndim=1), lambda x: x, 3)
+    blame = Blame.of(sd.local_support(0, ndim=1), lambda x: x, jnp.zeros(3))
     ends = jnp.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0], [7.0, 8.0, 9.0]])
     losses = jnp.array([[1.0, 2.0, jnp.nan], [2.0, 1.0, 7.0], [jnp.inf, 3.0, 8.0]])
     np.testing.assert_array_equal(best_of_each_place(blame, ends, losses), [1.0, 5.0, 6.0])

@@ -82,7 +82,8 @@ def around(y: Float[Array, "32 32"]) -> Callable[[Float[Array, "32 32"]], Array]
     falls = SIDE * land(y, places).reshape(2, 1, -1)
     tiles = jnp.arange(SIDE, dtype=y.dtype)[None, :, None] + 0.5
     column, row = (jnp.abs(falls - tiles) < REACH).astype(y.dtype)
-    return lambda params: (row * params.ravel()[None]) @ column.T
+    near = row[:, None] * column[None]
+    return lambda params: near @ params.ravel()
 
 
 def draw(y: Float[Array, "32 32"], rays: int, pixels: int) -> Float[Array, "pixels pixels"]:

@@ -22,7 +22,7 @@ and so are their weights averaged (Yang, Kalnay, Hunt and Bowler, 2009).
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,22 +37,27 @@ DAMPINGS = (30.0, 10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.01)
 _PAIRS, _TERMS = 64, 256
 
 
-@dataclass(frozen=True)
-class Blame:
-    """A support as a map between vectors, of n parameters and of the terms."""
+class Blame(NamedTuple):
+    """A support as a map between vectors.
 
-    support: AbstractSupport
-    tree: Callable[[Array], PyTree]
-    n: int
+    Attributes:
+        terms: For each term, the sum over the parameters that may influence it.
+        params: For each parameter, the sum over the terms that it may influence.
+    """
 
-    def terms(self, params: Float[Array, " n"]) -> Float[Array, " T"]:
-        """For each term, the sum over the parameters that may influence it."""
-        return self.support(self.tree(params)).ravel()
+    terms: Callable[[Float[Array, " n"]], Float[Array, " T"]]
+    params: Callable[[Float[Array, " T"]], Float[Array, " n"]]
 
-    def params(self, terms: Float[Array, " T"]) -> Float[Array, " n"]:
-        """For each parameter, the sum over the terms that it may influence."""
-        like = jax.ShapeDtypeStruct((self.n,), terms.dtype)
-        return jax.linear_transpose(self.terms, like)(terms)[0]
+    @staticmethod
+    def of(
+        support: AbstractSupport, tree: Callable[[Array], PyTree], theta: Float[Array, " n"]
+    ) -> "Blame":
+        """That of a support around the parameters, which `tree` makes of a vector."""
+        support = support.at(tree(theta))
+        # what depends on where the support is is computed here, and once
+        _, terms = jax.linearize(lambda x: support(tree(x)).ravel(), theta)
+        transposed = jax.linear_transpose(terms, theta)
+        return Blame(terms, lambda x: transposed(x)[0])
 
 
 def ensemble_steps(

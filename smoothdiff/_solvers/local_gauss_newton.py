@@ -216,7 +216,7 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         progress = state.progress
         params = self._params(y, progress.step, options)
         residuals = Residuals(fn, args, params, self.batch_size)
-        blame = Blame(self.support.at(y), params.layout.tree, params.theta.size)
+        blame = Blame.of(self.support, params.layout.tree, params.theta)
         key = jax.random.fold_in(read_options(options)[0], progress.step)
         sigma = params.sigma * state.scale
 
