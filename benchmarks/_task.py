@@ -81,7 +81,8 @@ class Task:
             picture minus its reference, say. A call is counted like a call of the loss.
         terms: y -> array, such that the loss is the sum of its entries, with `support`; or None. A
             call is counted likewise.
-        support: Which of the terms a parameter may influence, as for `smoothdiff.smooth`.
+        support: Which of the terms a parameter may influence, as for `smoothdiff.smooth`. Then the
+            first axes of the residuals are those of the terms.
         grey: The loss in two parts, for methods that use AD where they can; or None. With it, the
             loss is that of these parts, and costs an evaluation for each case.
         distance: How far y is from what is sought, y -> number, where that is not the length of

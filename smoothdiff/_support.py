@@ -148,6 +148,9 @@ def matrix_support(matrix: Any, shape: tuple[int, ...] | None = None) -> MatrixS
 def moving_support(around: Callable[[PyTree], Callable[[PyTree], Array]]) -> MovingSupport:
     """A support that depends on where the parameters are: that of a body which moves, say.
 
+    $$ S_{pj}(\\theta) = 1 \\text{ if parameter } j \\text{ may influence term } p
+       \\text{ near } \\theta, \\text{ else } 0 $$
+
     Transforms and solvers ask for it at each point where they sample.
 
     Args:
@@ -155,7 +158,10 @@ def moving_support(around: Callable[[PyTree], Callable[[PyTree], Array]]) -> Mov
             It is traced, so it may look at their values as JAX functions do.
 
     Returns:
-        A callable for the option `support`.
+        For the option `support`. It is no linear function itself: `.at(params)` is.
+
+    Raises:
+        TypeError: `around` is no function.
 
     Example:
         >>> import jax, jax.numpy as jnp, smoothdiff as sd
@@ -167,6 +173,8 @@ def moving_support(around: Callable[[PyTree], Callable[[PyTree], Array]]) -> Mov
         >>> g = sd.smooth_grad(terms, 0.5, support=support)
         >>> print(jnp.sign(g(jax.random.key(0), jnp.array([2.8, 6.3]))))
         [ 1. -1.]
+
+    Source: own.
     """
     if not callable(around):
         raise TypeError(f"around must be a function of the parameters, not {around!r}")
