@@ -728,14 +728,18 @@ def test_arguments_that_never_arrive_raise_instead_of_hanging(monkeypatch):
         jax.block_until_ready(jax.jit(f)(jnp.ones(3)))
 
 
-@pytest.mark.parametrize(("threads", "said"), [("1", "BlackBoxError"), ("2", "800000.0")])
-def test_large_arguments_need_two_threads_of_jax(threads, said):
-    """JAX reads NPROC as it starts, so this needs a process of its own."""
+@pytest.mark.parametrize("threads", ["1", "2"])
+def test_large_arguments_need_two_threads_of_jax(threads):
+    """The sum with two; with one it depends on who comes first, and there is an error, no hang.
+
+    JAX reads NPROC as it starts, so this needs a process of its own.
+    """
     script = """
-import functools
+import functools, os
 import numpy as np, jax, jax.numpy as jnp, smoothdiff as sd
 from smoothdiff import _black_box
-_black_box.wait_for = functools.partial(_black_box.wait_for, seconds=3.0)
+seconds = 3.0 if os.environ["NPROC"] == "1" else 60.0
+_black_box.wait_for = functools.partial(_black_box.wait_for, seconds=seconds)
 f = sd.black_box(lambda x: np.float32(x.mean()), jax.ShapeDtypeStruct((), jnp.float32))
 total = jax.jit(lambda xs: jnp.sum(jax.vmap(f)(xs)))
 xs = jnp.ones((8, 100_000))
@@ -747,4 +751,5 @@ print(float(xs.sum()))
     done = subprocess.run(
         [sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=300
     )
-    assert said in done.stdout + done.stderr, done.stderr
+    late = threads == "1" and "BlackBoxError" in done.stderr and "NPROC=2" in done.stderr
+    assert late or done.stdout == "800000.0\n", done.stderr

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from smoothdiff._params import as_key
+from smoothdiff._params import Params, as_key, take_apart
 
 # optax and norms mix dtypes (Adam raises a float to an integer), whatever the user's setting
 promotion = partial(jax.numpy_dtype_promotion, "standard")
@@ -119,6 +119,19 @@ def sigma_at(sigma: PyTree, step: Int[Array, ""]) -> PyTree:
     """The smoothing width of a step: an optax schedule is asked, anything else is what it is."""
     with promotion():
         return sigma(step) if callable(sigma) else sigma
+
+
+def smoothed_params(
+    solver: Any, y: PyTree[Array], step: Int[Array, ""], options: dict[str, Any]
+) -> Params:
+    """The parameters with the solver's sigma at a step, which every leaf must have."""
+    params = take_apart(y, sigma_at(solver.sigma, step), read_options(options)[1])
+    if params.free:
+        raise ValueError(
+            f"{type(solver).__name__} needs a sigma for every leaf of the parameters, not None: it "
+            "has no other derivatives"
+        )
+    return params
 
 
 def project(y: PyTree[Array], bounds: tuple[PyTree, PyTree] | None) -> PyTree[Array]:

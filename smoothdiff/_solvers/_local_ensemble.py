@@ -76,8 +76,7 @@ def ensemble_steps(
     """
     count = len(u)
     left, right = np.triu_indices(count)
-    own = jnp.maximum(blame.terms(jnp.ones_like(u[0])), 1)
-    around = lambda term: blame.terms(blame.params(term)) / own
+    around = lambda term: blame.terms(blame.params(term))
 
     def gram(pair: tuple[Array, Array]) -> Array:
         return around(jnp.sum(residuals[pair[0]] * residuals[pair[1]], axis=1))

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from smoothdiff._solvers._base import dot
+from smoothdiff._solvers._residual_batch import centred
 
 # the damping of each step, in units of the largest squared singular value
 _DAMPINGS = tuple(10.0**-k for k in range(8))
@@ -77,24 +78,13 @@ def local_steps(
             if the sum of squares falls outwards.
         high: The upper bounds likewise.
     """
-    slopes = _slopes(centred(points, valid), centred(residuals, valid), jnp.sum(valid))
+    of_all = lambda x: jax.vmap(centred)(x, valid).reshape(-1, x.shape[-1])
+    slopes = _slopes(of_all(points), of_all(residuals), jnp.sum(valid))
     if low is not None and high is not None:
         gradient = dot(slopes, here)
         held = ((low >= 0) & (gradient > 0)) | ((high <= 0) & (gradient < 0))
         slopes = jnp.where(held[:, None], 0, slopes)
     return _damped(slopes, here)
-
-
-def centred(x: Float[Array, "B M n"], valid: Bool[Array, "B M"]) -> Float[Array, "BM n"]:
-    """Seen from the mean of their own batch, as one batch; zeros where not valid.
-
-    By way of a valid row, so that columns that are the same in all rows become exact zeros.
-    """
-    first = jnp.take_along_axis(x, jnp.argmax(valid, axis=1)[:, None, None], axis=1)
-    x = jnp.where(valid[..., None], x - first, 0)
-    count = jnp.maximum(jnp.sum(valid, axis=1), 1).astype(x.dtype)
-    mean = jnp.sum(x, axis=1) / count[:, None]
-    return jnp.where(valid[..., None], x - mean[:, None], 0).reshape(-1, x.shape[-1])
 
 
 def _slopes(u: Array, r: Array, count: Array) -> Array:

@@ -91,6 +91,26 @@ def around(
     return draws.map(lambda z, _: jax.vmap(params.clip)(params.theta[None] + sigma[None] * z))
 
 
+def centred(x: Float[Array, "m k"], valid: Bool[Array, " m"]) -> Float[Array, "m k"]:
+    """Seen from the mean of the valid rows; zeros where not valid.
+
+    By way of one of them, so that columns that are the same in all rows become exact zeros.
+    """
+    x = jnp.where(valid[:, None], x - x[jnp.argmax(valid)][None], 0)
+    mean = jnp.sum(x, axis=0) / jnp.maximum(jnp.sum(valid), 1).astype(x.dtype)
+    return jnp.where(valid[:, None], x - mean[None], 0)
+
+
+def check_residuals(f_struct: PyTree) -> None:
+    """Raises TypeError unless all residuals are real floating-point numbers."""
+    for leaf in jax.tree.leaves(f_struct):
+        if not jnp.issubdtype(leaf.dtype, jnp.floating):
+            raise TypeError(
+                f"the residuals have dtype {leaf.dtype}; they must be real floating-point "
+                "numbers: use .astype(float)"
+            )
+
+
 def fresh_loss(
     residuals: Residuals, points: Float[Array, "m n"], nonfinite: str
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:

@@ -8,9 +8,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
-from smoothdiff._params import Params, take_apart
+from smoothdiff._params import Params
 from smoothdiff._samplers import AbstractSampler, Gaussian, Sobol
 from smoothdiff._solvers._base import (
     AbstractSmoothSolver,
@@ -19,13 +19,19 @@ from smoothdiff._solvers._base import (
     judge,
     promotion,
     read_options,
-    sigma_at,
+    smoothed_params,
     stopped,
     unless_failed,
 )
 from smoothdiff._solvers._local_steps import TRIED, steps_to_try
 from smoothdiff._solvers._parameter_regression import gauss_newton_step
-from smoothdiff._solvers._residual_batch import ResidualBatch, Residuals, around, fresh_loss
+from smoothdiff._solvers._residual_batch import (
+    ResidualBatch,
+    Residuals,
+    around,
+    check_residuals,
+    fresh_loss,
+)
 from smoothdiff._solvers._residual_history import History
 from smoothdiff._solvers._residual_search import ResidualSearch, next_scale
 from smoothdiff._solvers._restarts import Restarts, check_restarts
@@ -198,12 +204,6 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         tried = TRIED if n >= _MANY and first >= 3 * TRIED else 0
         return first - tried, later - tried, tried
 
-    def _params(self, y: PyTree, step: Int[Array, ""], options: dict) -> Params:
-        params = take_apart(y, sigma_at(self.sigma, step), read_options(options)[1])
-        if params.free:
-            raise ValueError("GaussNewton needs a sigma for every leaf of the parameters, not None")
-        return params
-
     def _points(self, params: Params, key: Array, sigma: Array, count: int) -> Array:
         # few Sobol points are all but the same in some pairs of very many dimensions
         sampler = self.sampler or (Sobol() if params.theta.size < _MANY else Gaussian())
@@ -239,21 +239,15 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> GaussNewtonState:
         """Checks what can be looked at; evaluates nothing."""
-        params = self._params(y, jnp.asarray(0, jnp.int32), options)
-        leaves = jax.tree.leaves(f_struct)
-        for leaf in leaves:
-            if not jnp.issubdtype(leaf.dtype, jnp.floating):
-                raise TypeError(
-                    f"the residuals have dtype {leaf.dtype}; they must be real floating-point "
-                    "numbers: use .astype(float)"
-                )
+        params = smoothed_params(self, y, jnp.asarray(0, jnp.int32), options)
+        check_residuals(f_struct)
         n, dtype = params.theta.size, params.theta.dtype
         first, *_ = self._evaluations(y)
         if self.history is None:
             length = max(min(max(12 * n, 32), 256), (3 if n < _MANY else 4) * first)
         else:
             length = max(self.history, first)
-        size = sum(leaf.size for leaf in leaves)
+        size = sum(leaf.size for leaf in jax.tree.leaves(f_struct))
         search = ResidualSearch.start(History.empty(length, n, size, dtype))
         restarts = Restarts.start(self.restarts, params.theta, search.scale)
         return GaussNewtonState(Progress.start(y, dtype), search, restarts)
@@ -261,7 +255,7 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     def step(self, fn, y, args, options, state, tags):
         """One batch, one regression, one step."""
         progress, search = state.progress, state.search
-        params = self._params(y, progress.step, options)
+        params = smoothed_params(self, y, progress.step, options)
         residuals = Residuals(fn, args, params, self.batch_size)
         key = jax.random.fold_in(read_options(options)[0], progress.step)
         count, _, tried = self._evaluations(y)
@@ -324,7 +318,7 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         scale = state.search.scale if state.restarts is None else state.restarts.kernel
 
         def estimate(y):
-            params = self._params(y, progress.step, options)
+            params = smoothed_params(self, y, progress.step, options)
             points = self._points(params, key, params.sigma * scale, count)
             residuals = Residuals(fn, args, params, self.batch_size)
             return fresh_loss(residuals, points, self.nonfinite)

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from smoothdiff._params import Params, take_apart
 from smoothdiff._samplers import AbstractSampler, Gaussian
 from smoothdiff._solvers._base import (
     AbstractSmoothSolver,
@@ -18,7 +17,7 @@ from smoothdiff._solvers._base import (
     judge,
     promotion,
     read_options,
-    sigma_at,
+    smoothed_params,
     stopped,
     unless_failed,
 )
@@ -28,8 +27,14 @@ from smoothdiff._solvers._local_ensemble import (
     best_of_each_place,
     ensemble_steps,
 )
-from smoothdiff._solvers._local_steps import centred
-from smoothdiff._solvers._residual_batch import ResidualBatch, Residuals, around, fresh_loss
+from smoothdiff._solvers._residual_batch import (
+    ResidualBatch,
+    Residuals,
+    around,
+    centred,
+    check_residuals,
+    fresh_loss,
+)
 from smoothdiff._support import AbstractSupport, as_support
 
 # ends that are evaluated in a step: one for each damping, and the best of each place
@@ -86,16 +91,14 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             term-shaped arrays with entries 0 and 1. The residuals are one array with the shape of
             the terms; further axes, such as colours, belong to their term.
         num_samples: evaluations a step, at least 12, nine of which are the ends that are tried. By
-            default up to 96: about n / 2 samples, between 16 and 87, and fewer for more than about
-            a thousand terms, so that a step takes seconds at most (for 65,536 terms 28).
+            default up to 96: about n / 2 samples, between 16 and 87, and fewer for more than 760
+            terms, so that a step takes seconds at most (for 65,536 terms 28).
         sampler: where to sample.
-        batch_size: evaluate at most so many samples at a time, as for `smooth`.
-        nonfinite: "propagate" or "drop" samples with a NaN or an infinity in their residuals; as
-            long as half of a batch are finite. The ends that are tried may be anything.
-        rtol: relative tolerance. The run has converged when three steps in a row and their sigma
-            are below `atol + rtol * norm(y)`.
-        atol: absolute tolerance. By default both are zero, and the run uses up its budget.
-        norm: the norm of steps and iterates.
+        batch_size: as for `GaussNewton`.
+        nonfinite: as for `GaussNewton`. Where all nine ends fail, the iterate stays.
+        rtol: as for `GaussNewton`.
+        atol: as for `GaussNewton`.
+        norm: as for `GaussNewton`.
 
     Raises:
         ValueError: fewer than 12 evaluations a step, another word for `nonfinite`; and, when it
@@ -182,18 +185,11 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         affordable = int((_CUBES / max(terms, 1)) ** (1 / 3))
         return max(_FEWEST, min(n // 2, _MOST, affordable))
 
-    def _params(self, y: PyTree, step: Int[Array, ""], options: dict) -> Params:
-        params = take_apart(y, sigma_at(self.sigma, step), read_options(options)[1])
-        if params.free:
-            raise ValueError(
-                "LocalGaussNewton needs a sigma for every leaf of the parameters, not None"
-            )
-        return params
-
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> LocalGaussNewtonState:
         """Checks what can be looked at; evaluates nothing."""
-        params = self._params(y, jnp.asarray(0, jnp.int32), options)
+        params = smoothed_params(self, y, jnp.asarray(0, jnp.int32), options)
         terms = jax.eval_shape(self.support.at(y), y)
+        check_residuals(f_struct)
         leaves = jax.tree.leaves(f_struct)
         if len(leaves) != 1 or leaves[0].shape[: len(terms.shape)] != terms.shape:
             shapes = [leaf.shape for leaf in leaves]
@@ -202,11 +198,6 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
                 f"residuals have shape {shapes[0] if len(shapes) == 1 else shapes}: return one "
                 "array whose first axes are those of the terms"
             )
-        if not jnp.issubdtype(leaves[0].dtype, jnp.floating):
-            raise TypeError(
-                f"the residuals have dtype {leaves[0].dtype}; they must be real floating-point "
-                "numbers: use .astype(float)"
-            )
         dtype = params.theta.dtype
         one, none = jnp.ones((), dtype), jnp.zeros((), jnp.int32)
         return LocalGaussNewtonState(Progress.start(y, dtype), one, none)
@@ -214,7 +205,7 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     def step(self, fn, y, args, options, state, tags):
         """One batch, one step in each place, the best of nine ends."""
         progress = state.progress
-        params = self._params(y, progress.step, options)
+        params = smoothed_params(self, y, progress.step, options)
         residuals = Residuals(fn, args, params, self.batch_size)
         blame = Blame.of(self.support, params.layout.tree, params.theta)
         key = jax.random.fold_in(read_options(options)[0], progress.step)
@@ -228,15 +219,15 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         fun, stderr = batch.loss()
         scale = state.scale
         if not callable(self.sigma):
-            # of a function without any noise, the samples are as good as the iterate on a plateau
-            still = jnp.where(scale < 1, jnp.minimum(_GROW * scale, 1), scale)
-            scale = jnp.where(fun > _NOISE * lowest, _SHRINK * scale, still)
-            scale = jnp.where(batch.same(), 2 * state.scale, scale)
+            # only a plateau makes it wider than the user's, and it does not jump back from there
+            wider = jnp.where(scale < 1, jnp.minimum(_GROW * scale, 1), scale)
+            wanted = jnp.where(fun > _NOISE * lowest, _SHRINK * scale, wider)
+            scale = jnp.where(batch.same(), 2 * scale, wanted)
         new_y = params.layout.tree(theta)
         with promotion():
             moved = self.norm(params.layout.tree(jnp.abs(theta - params.theta) + sigma))
             small = jnp.where(moved < self.atol + self.rtol * self.norm(y), state.small + 1, 0)
-        finite = batch.enough(self.nonfinite) & all_finite((fun, theta, scale, lowest))
+        finite = batch.enough(self.nonfinite) & all_finite((fun, theta, scale))
         new_y, scale = unless_failed(finite, (new_y, scale), (y, state.scale))
         progress = progress.after(y, fun, stderr, sigma, len(points) + _TRIED, finite)
         return new_y, LocalGaussNewtonState(progress, scale, small), aux
@@ -251,7 +242,7 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         key = jax.random.fold_in(read_options(options)[0], progress.step)
 
         def estimate(y):
-            params = self._params(y, progress.step, options)
+            params = smoothed_params(self, y, progress.step, options)
             sigma = params.sigma * state.scale
             points = around(params, self.sampler, key, sigma, self._samples(y))
             residuals = Residuals(fn, args, params, self.batch_size)
@@ -267,23 +258,24 @@ def _next(
 ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     """The best of the ends of the steps that a batch suggests, and half the sum of squares there.
 
-    That is infinite where no end is finite.
+    Where no end is finite, the iterate and zero, so that the next samples are nearer.
     """
     params = residuals.params
     terms = blame.terms(params.theta).size
     by_term = lambda rows: rows.reshape(-1, terms, rows.shape[1] // terms)
-    good = batch.good[None]
-    u = centred(batch.points[None], good) / sigma[None]
-    rows = centred(batch.rows[None], good)
+    u = centred(batch.points, batch.good) / sigma[None]
+    rows = centred(batch.rows, batch.good)
     count = jnp.maximum(jnp.sum(batch.good), 1).astype(rows.dtype)
     mean = jnp.sum(batch.rows, axis=0) / count
 
     steps = ensemble_steps(blame, u, by_term(rows), by_term(mean[None])[0])
     ends = jax.vmap(params.clip)(params.theta[None] + sigma[None] * steps)
-    there = jnp.sum(by_term(residuals(ends)[0]) ** 2, axis=2)
-    mixed = best_of_each_place(blame, ends, there)[None]
+    squares = jnp.sum(by_term(residuals(ends)[0]) ** 2, axis=2)
+    mixed = best_of_each_place(blame, ends, squares)[None]
     last = jnp.sum(by_term(residuals(mixed)[0]) ** 2, axis=2)
-    losses = jnp.sum(jnp.concatenate([there, last]), axis=1) / 2
+    losses = jnp.sum(jnp.concatenate([squares, last]), axis=1) / 2
     losses = jnp.where(jnp.isfinite(losses), losses, jnp.inf)
     best = jnp.argmin(losses)
-    return jnp.concatenate([ends, mixed])[best], losses[best]
+    there = jnp.isfinite(losses[best])
+    theta = jnp.where(there, jnp.concatenate([ends, mixed])[best], params.theta)
+    return theta, jnp.where(there, losses[best], 0)

@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from smoothdiff._batch import Batch, evaluate
 from smoothdiff._estimate import combine
@@ -22,7 +22,7 @@ from smoothdiff._solvers._base import (
     judge,
     promotion,
     read_options,
-    sigma_at,
+    smoothed_params,
     stopped,
     unless_failed,
 )
@@ -158,12 +158,6 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     def _adaptive(self) -> bool:
         return not callable(self.sigma)
 
-    def _params(self, y: PyTree, step: Int[Array, ""], options: dict[str, Any]) -> Params:
-        params = take_apart(y, sigma_at(self.sigma, step), read_options(options)[1])
-        if params.free:
-            raise ValueError("NewtonCG needs a sigma for every leaf: it has no other derivatives")
-        return params
-
     def _metric(self, metric: Metric, params: Params) -> Metric:
         """That of the search, unless a schedule says how wide to sample."""
         return metric if self._adaptive else Metric.of(params.sigma, False)
@@ -208,7 +202,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> NewtonCGState:
         """Checks what can be looked at; evaluates nothing."""
         step = jnp.asarray(0, jnp.int32)
-        params = self._params(y, step, options)
+        params = smoothed_params(self, y, step, options)
         theta, metric = params.theta, Metric.of(params.sigma, self._adaptive)
         search = Search.start(theta, metric, self._kept(y, theta.size))
         restarts = Restarts.start(self.restarts, theta, (metric, search.trust.width))
@@ -217,7 +211,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     def step(self, fn, y, args, options, state, tags):
         """One batch, one Newton step from all samples that are kept."""
         progress, search, trust = state.progress, state.search, state.search.trust
-        params = self._params(y, progress.step, options)
+        params = smoothed_params(self, y, progress.step, options)
         theta = params.theta
         metric = self._metric(search.metric, params)
         batch = self._batch(fn, y, args, params, metric, trust.width, progress.step, options)
@@ -297,13 +291,13 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         turned, wide = kernel if state.restarts is None else state.restarts.kernel
 
         def estimate(y):
-            params = self._params(y, progress.step, options)
+            params = smoothed_params(self, y, progress.step, options)
             metric = self._metric(turned, params)
             batch = self._batch(fn, y, args, params, metric, wide, progress.step, options)
             value = combine(batch, jnp.zeros_like(params.theta))
             return value, value_stderr(batch, value)
 
-        params = self._params(y, progress.step, options)
+        params = smoothed_params(self, y, progress.step, options)
         accepted = params.layout.tree(search.accepted)
         y, fun, stderr = judge(estimate, y, accepted, progress.best_y)
         evaluations = progress.evaluations + self.final_evaluations(y)

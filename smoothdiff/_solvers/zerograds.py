@@ -10,7 +10,7 @@ import optax
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from smoothdiff._params import Params, take_apart
+from smoothdiff._params import Params
 from smoothdiff._samplers import AbstractSampler, Gaussian
 from smoothdiff._solvers._base import (
     AbstractSmoothSolver,
@@ -20,6 +20,7 @@ from smoothdiff._solvers._base import (
     promotion,
     read_options,
     sigma_at,
+    smoothed_params,
     stopped,
     unless_failed,
 )
@@ -207,12 +208,6 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
         """A batch for each of the two candidates."""
         return 2 * self.num_samples
 
-    def _params(self, y: PyTree, step: Int[Array, ""], options: dict[str, Any]) -> Params:
-        params = take_apart(y, sigma_at(self.sigma, step), read_options(options)[1])
-        if params.free:
-            raise ValueError("ZeroGrads needs a sigma for every leaf: it has no other derivatives")
-        return params
-
     def _make(self, params: Params, options: dict[str, Any]) -> tuple[PyTree, PyTree]:
         """The surrogate before any fit: its weights, and the rest of it."""
         surrogate = self.surrogate
@@ -232,7 +227,7 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> ZeroGradsState:
         """Makes the surrogate and checks what can be looked at; evaluates nothing."""
         step = jnp.asarray(0, jnp.int32)
-        params = self._params(y, step, options)
+        params = smoothed_params(self, y, step, options)
         self._locality(params, y, step, options)
         weights, _ = self._make(params, options)
         fitting = self.surrogate_optimizer.init(weights)
@@ -272,7 +267,7 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
             ValueError: as a run does, a leaf without a sigma.
         """
         options = {"key": jax.random.key(0)}  # of weights that the learnt ones replace
-        params = self._params(y, state.progress.step, options)
+        params = smoothed_params(self, y, state.progress.step, options)
         _, rest = self._make(params, options)
         surrogate, fit = eqx.combine(state.fit.weights, rest), state.fit
         return lambda y: fit.value(surrogate, params.layout.vector(jax.tree.leaves(y)))
@@ -280,7 +275,7 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
     def step(self, fn, y, args, options, state, tags):
         """One batch, updates of the surrogate on it, and of the parameters on the surrogate."""
         progress = state.progress
-        params = self._params(y, progress.step, options)
+        params = smoothed_params(self, y, progress.step, options)
         locality = self._locality(params, y, progress.step, options)
         rho, batch = locality.around(lambda y: fn(y, args))
         _, rest = self._make(params, options)
@@ -326,7 +321,7 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
         progress = state.progress
 
         def estimate(y):
-            params = self._params(y, progress.step, options)
+            params = smoothed_params(self, y, progress.step, options)
             locality = self._locality(params, y, progress.step, options)
             return locality.mean(locality.smoothed(lambda y: fn(y, args)))
 
