@@ -13,9 +13,9 @@ more say than those further off. A parameter takes the mean of the steps of its 
 
 $$ \Delta_j = \sum_t S_{tj} \, (w_t \cdot u_j) / \sum_t S_{tj}. $$
 
-So nothing larger than M x M is solved, and steps change as smoothly from place to place as supports
-overlap. To solve once for each parameter instead, by its own terms alone, converges more slowly
-where supports overlap, and takes longer.
+So nothing larger than M x M is solved, once for all dampings, and steps change as smoothly from
+place to place as supports overlap. To solve once for each parameter
+instead, by its own terms alone, converges more slowly where supports overlap, and takes longer.
 
 Source: own; ensemble Kalman filters are localised like this (Hunt, Kostelich and Szunyogh, 2007),
 and so are their weights averaged (Yang, Kalnay, Hunt and Bowler, 2009).
@@ -29,6 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from smoothdiff._solvers._base import dot
 from smoothdiff._support import AbstractSupport
 
 # of each step, in units of the mean diagonal
@@ -76,7 +77,9 @@ def ensemble_steps(
     """
     count = len(u)
     left, right = np.triu_indices(count)
-    around = lambda term: blame.terms(blame.params(term))
+    place = np.zeros((count, count), np.int32)
+    place[left, right] = place[right, left] = np.arange(len(left))
+    around = _around(blame, len(mean), len(left), u.dtype)
 
     def gram(pair: tuple[Array, Array]) -> Array:
         return around(jnp.sum(residuals[pair[0]] * residuals[pair[1]], axis=1))
@@ -89,14 +92,11 @@ def ensemble_steps(
 
     def weights(term: tuple[Array, Array]) -> Array:
         entries, side = term
-        matrix = jnp.zeros((count, count), u.dtype)
-        matrix = matrix.at[left, right].set(entries).at[right, left].set(entries)
+        matrix = entries[place]
         level = jnp.trace(matrix) / count
-        damping = jnp.asarray(DAMPINGS, u.dtype) * jnp.where(level > 0, level, 1)
-        solve = lambda d: jax.scipy.linalg.solve(
-            matrix + d * jnp.eye(count, dtype=u.dtype), side, assume_a="pos"
+        return _damped(
+            matrix, side, jnp.asarray(DAMPINGS, u.dtype) * jnp.where(level > 0, level, 1)
         )
-        return jax.vmap(solve)(damping)
 
     found = jax.lax.map(weights, (grams.T, sides.T), batch_size=_TERMS)
 
@@ -107,6 +107,30 @@ def ensemble_steps(
     total = jnp.zeros((len(DAMPINGS), u.shape[1]), u.dtype)
     total, _ = jax.lax.scan(add, total, (jnp.transpose(found, (2, 1, 0)), u))
     return -total / jnp.maximum(blame.params(jnp.ones_like(mean[:, 0])), 1)[None]
+
+
+def _around(
+    blame: Blame, terms: int, uses: int, dtype: jnp.dtype
+) -> Callable[[Float[Array, " T"]], Float[Array, " T"]]:
+    """The product with N, as a matrix where that is fewer supports to go through than `uses`."""
+    along = lambda term: blame.terms(blame.params(term))
+    if terms >= uses:
+        return along
+    shared = jax.lax.map(along, jnp.eye(terms, dtype=dtype), batch_size=_PAIRS)
+    return lambda term: dot(shared, term)
+
+
+def _damped(
+    matrix: Float[Array, "M M"], side: Float[Array, " M"], damping: Float[Array, " k"]
+) -> Float[Array, "k M"]:
+    """The solutions of (matrix + damping I) x = side, from one tridiagonalisation."""
+    packed, diagonal, beside, taus = jax.lax.linalg.tridiagonal(matrix, lower=True)
+    turn = jax.lax.linalg.householder_product(packed[1:, :-1], taus)
+    turned = jnp.concatenate([side[:1], dot(side[1:], turn)])[:, None]
+    below, above = jnp.pad(beside, (1, 0)), jnp.pad(beside, (0, 1))
+    solve = lambda d: jax.lax.linalg.tridiagonal_solve(below, diagonal + d, above, turned)[:, 0]
+    found = jax.vmap(solve)(damping)
+    return jnp.concatenate([found[:, :1], dot(found[:, 1:], turn.T)], axis=1)
 
 
 def best_of_each_place(
