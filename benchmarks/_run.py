@@ -14,7 +14,7 @@ from benchmarks import methods, tasks
 from benchmarks._task import Method, NotAble, Solve, Task
 
 STARTS = {"quick": 5, "full": 20}  # of most scenes: a guess, for the bar only
-LONGEST = 20_000  # parameters; more are in the pictures and in the files of the runs only
+LONGEST = 2_000  # parameters; more are in the pictures and in the files of the runs only
 
 
 def run_one(
