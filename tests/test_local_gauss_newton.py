@@ -56,23 +56,26 @@ def squares(y, fun=off):
 # the step
 
 
-def test_steps_are_those_of_the_formula(x64):
+@pytest.mark.parametrize(("samples", "terms"), [(6, 5), (3, 9)])
+def test_steps_are_those_of_the_formula(samples, terms, x64):
+    """With more pairs of samples than terms, so that N is written down, and with fewer."""
     rng = np.random.default_rng(1)
-    matrix = (rng.random((5, 7)) < 0.5).astype(float)
+    matrix = (rng.random((terms, 7)) < 0.5).astype(float)
     matrix[:, 6] = 0  # a parameter that moves nothing
     matrix[4] = 0  # a term that nothing moves
-    u, rows, mean = rng.normal(size=(6, 7)), rng.normal(size=(6, 5, 2)), rng.normal(size=(5, 2))
+    u, mean = rng.normal(size=(samples, 7)), rng.normal(size=(terms, 2))
+    rows = rng.normal(size=(samples, terms, 2))
     blame = Blame.of(sd.matrix_support(matrix), lambda x: x, jnp.zeros(7))
     found = ensemble_steps(blame, jnp.asarray(u), jnp.asarray(rows), jnp.asarray(mean))
     shared = matrix @ matrix.T
     for damping, step in zip(DAMPINGS, found, strict=True):
-        weights = np.zeros((5, 6))
+        weights = np.zeros((terms, samples))
         for t, near in enumerate(shared):
             gram = np.einsum("s,asq,bsq->ab", near, rows, rows)
             side = np.einsum("s,asq,sq->a", near, rows, mean)
-            level = np.trace(gram) / 6
+            level = np.trace(gram) / samples
             if level > 0:
-                weights[t] = -np.linalg.solve(gram + damping * level * np.eye(6), side)
+                weights[t] = -np.linalg.solve(gram + damping * level * np.eye(samples), side)
         count = np.maximum(matrix.sum(axis=0), 1)
         expected = np.einsum("tj,ta,aj->j", matrix, weights, u) / count
         np.testing.assert_allclose(step, expected, rtol=1e-9, atol=1e-12)

@@ -124,7 +124,11 @@ def sigma_at(sigma: PyTree, step: Int[Array, ""]) -> PyTree:
 def smoothed_params(
     solver: Any, y: PyTree[Array], step: Int[Array, ""], options: dict[str, Any]
 ) -> Params:
-    """The parameters with the solver's sigma at a step, which every leaf must have."""
+    """The parameters with the solver's sigma at a step.
+
+    Raises:
+        ValueError: a leaf without a sigma.
+    """
     params = take_apart(y, sigma_at(solver.sigma, step), read_options(options)[1])
     if params.free:
         raise ValueError(

@@ -13,9 +13,10 @@ more say than those further off. A parameter takes the mean of the steps of its 
 
 $$ \Delta_j = \sum_t S_{tj} \, (w_t \cdot u_j) / \sum_t S_{tj}. $$
 
-So nothing larger than M x M is solved, once for all dampings, and steps change as smoothly from
-place to place as supports overlap. To solve once for each parameter
-instead, by its own terms alone, converges more slowly where supports overlap, and takes longer.
+So nothing larger than M x M is solved, once for all dampings (by a tridiagonalisation, which JAX
+has for CPUs and GPUs), and steps change as smoothly from place to place as supports overlap. To
+solve once for each parameter instead, by its own terms alone, converges more slowly where supports
+overlap, and takes longer.
 
 Source: own; ensemble Kalman filters are localised like this (Hunt, Kostelich and Szunyogh, 2007),
 and so are their weights averaged (Yang, Kalnay, Hunt and Bowler, 2009).
@@ -79,13 +80,13 @@ def ensemble_steps(
     left, right = np.triu_indices(count)
     place = np.zeros((count, count), np.int32)
     place[left, right] = place[right, left] = np.arange(len(left))
-    around = _around(blame, len(mean), len(left), u.dtype)
+    neighbours = _neighbours(blame, len(mean), len(left), u.dtype)
 
     def gram(pair: tuple[Array, Array]) -> Array:
-        return around(jnp.sum(residuals[pair[0]] * residuals[pair[1]], axis=1))
+        return neighbours(jnp.sum(residuals[pair[0]] * residuals[pair[1]], axis=1))
 
     def side(row: Array) -> Array:
-        return around(jnp.sum(row * mean, axis=1))
+        return neighbours(jnp.sum(row * mean, axis=1))
 
     grams = jax.lax.map(gram, (left, right), batch_size=_PAIRS)
     sides = jax.lax.map(side, residuals, batch_size=_PAIRS)
@@ -94,9 +95,8 @@ def ensemble_steps(
         entries, side = term
         matrix = entries[place]
         level = jnp.trace(matrix) / count
-        return _damped(
-            matrix, side, jnp.asarray(DAMPINGS, u.dtype) * jnp.where(level > 0, level, 1)
-        )
+        damping = jnp.asarray(DAMPINGS, u.dtype) * jnp.where(level > 0, level, 1)
+        return _solve_damped(matrix, side, damping)
 
     found = jax.lax.map(weights, (grams.T, sides.T), batch_size=_TERMS)
 
@@ -109,18 +109,18 @@ def ensemble_steps(
     return -total / jnp.maximum(blame.params(jnp.ones_like(mean[:, 0])), 1)[None]
 
 
-def _around(
+def _neighbours(
     blame: Blame, terms: int, uses: int, dtype: jnp.dtype
 ) -> Callable[[Float[Array, " T"]], Float[Array, " T"]]:
-    """The product with N, as a matrix where that is fewer supports to go through than `uses`."""
-    along = lambda term: blame.terms(blame.params(term))
+    """The product with N, which is written down if it is used more often than it has columns."""
+    product = lambda term: blame.terms(blame.params(term))
     if terms >= uses:
-        return along
-    shared = jax.lax.map(along, jnp.eye(terms, dtype=dtype), batch_size=_PAIRS)
+        return product
+    shared = jax.lax.map(product, jnp.eye(terms, dtype=dtype), batch_size=_PAIRS)
     return lambda term: dot(shared, term)
 
 
-def _damped(
+def _solve_damped(
     matrix: Float[Array, "M M"], side: Float[Array, " M"], damping: Float[Array, " k"]
 ) -> Float[Array, "k M"]:
     """The solutions of (matrix + damping I) x = side, from one tridiagonalisation."""

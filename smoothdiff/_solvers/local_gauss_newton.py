@@ -78,7 +78,8 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     lowest smoothed loss is kept, and judged at the end.
 
     `GaussNewton` needs no support, but a time and a memory that grow with the number of parameters
-    times that of residuals. Here M^2 numbers are kept for each term.
+    times that of residuals. Here M^2 numbers are kept for each term. It runs on CPUs and GPUs; on
+    TPUs JAX has no tridiagonalisation.
 
     Args:
         sigma: the smoothing width in the units of the parameters, positive for each of them. A
