@@ -254,11 +254,13 @@ def test_grey_boxes_train_a_network(name, monkeypatch, standard_promotion):
 
 
 def test_gauss_newton_finds_what_a_network_is_to_answer(monkeypatch, standard_promotion):
+    monkeypatch.setattr(grey_gauss_newton, "LESSONS", (8, 24))
     task, found, per_step = trained(
         grey_gauss_newton.prepare, (grey_gauss_newton, "RATE", 0.05), monkeypatch
     )
-    # all cases at once; a step of each, and two to choose between the network and the solver
-    assert per_step == 16 * (6 + 2)
+    # all cases at once; a step of each, two to choose between the network and the solver, and as
+    # many that are there to be learnt from
+    assert per_step == 16 * 2 * (6 + 2)
     assert task.loss(found[-1]) < 1e-4 * task.loss(task.start(0))
 
 
@@ -266,6 +268,7 @@ def test_cases_learn_from_each_other_and_not_from_renders_that_failed(
     monkeypatch, standard_promotion
 ):
     """A renderer that fails in a corner of its parameters, in which no picture is."""
+    monkeypatch.setattr(grey_gauss_newton, "LESSONS", (8, 24))
     task = linear_grey()
     assert task.grey is not None
     draw = task.grey.render
@@ -283,7 +286,7 @@ def test_cases_learn_from_each_other_and_not_from_renders_that_failed(
     task, found, per_step = trained(
         grey_gauss_newton.prepare, (grey_gauss_newton, "RATE", 0.05), monkeypatch, task
     )
-    assert per_step == 6 + 2
+    assert per_step == 2 * (6 + 2)
     jax.effects_barrier()
     assert any(failed)
     assert np.isfinite(found).all()
