@@ -283,6 +283,8 @@ def test_cases_learn_from_each_other_and_not_from_renders_that_failed(
     task = dataclasses.replace(task, grey=grey, loss=grey.loss)
     # one case has a step at a time, and the others see what was rendered for it
     monkeypatch.setattr(grey_gauss_newton, "CASES", 1)
+    # fewer renders are kept than made
+    monkeypatch.setattr(grey_gauss_newton, "KEPT", 512)
     task, found, per_step = trained(
         grey_gauss_newton.prepare, (grey_gauss_newton, "RATE", 0.05), monkeypatch, task
     )
@@ -291,7 +293,18 @@ def test_cases_learn_from_each_other_and_not_from_renders_that_failed(
     assert any(failed)
     assert np.isfinite(found).all()
     # each case has had two steps when all have learned from 32 of them
-    assert task.loss(found[2 * 16]) < 0.2 * task.loss(task.start(0))
+    assert task.loss(found[2 * 16 - 1]) < 0.2 * task.loss(task.start(0))
+
+
+def test_new_poses_are_spread_like_those_found(key):
+    scale = jnp.array([1.0, 20.0, 0.0])
+    found = scale[None] * jax.random.uniform(key, (256, 3)) + 5
+    poses = grey_gauss_newton._like(jax.random.key(1), found, (40, 50)).reshape(-1, 3)
+    assert (poses >= found.min(0)[None]).all()
+    assert (poses <= found.max(0)[None]).all()
+    np.testing.assert_allclose(poses.std(0), found.std(0), rtol=0.15)
+    # hardly any is one of those found
+    assert len(np.unique(poses[:, 0])) > 1500
 
 
 @pytest.mark.parametrize("prepare", [grey_box.VARIANTS["grey_fr22"][1], grey_gauss_newton.prepare])

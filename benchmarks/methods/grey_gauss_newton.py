@@ -1,17 +1,18 @@
 """Grey boxes: what the black box is to be given, by Gauss-Newton, and a network that learns it.
 
 Each case has a solver of its own, which takes a step when it is the case's turn, from the best of
-three: where it was, the network's answer, and what came nearest of all renders so far, whichever
-case they were made for. So cases help one another, and no case stays in a valley that others have
-shown to be a wrong one.
+these: where it was, the network's answer, poses drawn for this step, and what came nearest of all
+renders so far, whichever case they were made for. So cases help one another, and no case stays in a
+valley that others have shown to be a wrong one.
 
 The network is trained by AD, which costs no evaluations: to answer what is known to be best, and
 for a render what was rendered. So it has as many pictures to learn from as there were renders, of
-which those within the range of what is known to be best count. Half of all renders are made for
-that alone, as those of the solvers soon look like the pictures themselves, and a network that has
-learnt these by heart fails on others: they are drawn from a kernel density estimate of what is
-known to be best. Lessons become more as there is more to learn, and the weights of late lessons
-are averaged (Shamir and Zhang, Stochastic gradient descent for non-smooth optimization, 2013).
+which those within the range of what is known to be best count. The renders of the solvers soon look
+like the pictures themselves, and a network that has learnt these by heart fails on others. Hence
+half of all renders are of poses from a kernel density estimate of what is known to be best; what
+lies beyond its range is moved to the edge. Lessons become more as there is more to learn, and the
+weights of late lessons are averaged (Shamir and Zhang, Stochastic gradient descent for non-smooth
+optimization, 2013); it is these that the solvers ask.
 
 Splitting a network where AD ends is the method of auxiliary coordinates (Carreira-Perpinan and
 Wang, Distributed optimization of deeply nested systems, 2014).
@@ -37,7 +38,7 @@ BATCH = 16, 48  # cases in a lesson, and renders
 KEPT = 16384  # renders to learn from, the last ones
 DOUBT = 0.2  # in units of sigma: an error beyond it may be the solver's
 RATE, DECAY = 3e-3, 0.02  # of Adam, and what is left of it at the end
-TENTH = 10  # the weights that count are the mean over about the last tenth of all lessons
+LATE = 10  # in the mean of all weights those after t lessons count about as the ninth power of t
 
 
 class Known(NamedTuple):
@@ -73,21 +74,12 @@ def prepare(task: Task) -> Solve:
     solver = sd.GaussNewton(grey.sigma, num_samples=samples, history=2 * samples)
     function = lambda x, picture: (render(x) - picture, None)
     drawn = min(CASES, count)
-    # of a step: the solver's samples, where it was, the network's answer; and as many new poses
-    new = samples + 2
-    rounds = max(1, task.budget.evaluations // (drawn * 2 * new))
+    # renders of the solver: its samples, where it was, the network's answer; and as many new poses
+    each = samples + 2
+    rounds = max(1, task.budget.evaluations // (drawn * 2 * each))
     lessons = np.linspace(*LESSONS, rounds).astype(int)
     optim = optax.adam(optax.linear_schedule(RATE, DECAY * RATE, int(lessons.sum())))
     answers = jax.jit(lambda y: jax.vmap(partial(grey.white, y))(pictures))
-
-    def spread(key, best):
-        """Poses from a kernel density estimate of the best ones, by Scott's rule."""
-        which, where = jax.random.split(key)
-        width = jnp.std(best, axis=0) * count ** (-1 / (answer.size + 4))
-        poses = jax.random.choice(which, best, (drawn, new))
-        poses += width[None, None] * jax.random.normal(where, poses.shape)
-        low, high = jnp.min(best, axis=0), jnp.max(best, axis=0)
-        return jnp.clip(poses, low[None, None], high[None, None])
 
     def step(key, said, others, best, loss, at, state, picture):
         """One step of one solver, and what was rendered for it, and of other poses."""
@@ -115,9 +107,10 @@ def prepare(task: Task) -> Solve:
     @jax.jit
     def solve_some(key, y, known, rendered, chosen):
         """Steps of the solvers of some cases, from whose renders all cases learn."""
-        key, *keys = jax.random.split(key, drawn + 1)
+        draw, *keys = jax.random.split(key, drawn + 1)
         said = jax.vmap(partial(grey.white, y))(pictures[chosen])
-        others = spread(key, known.best)
+        # at first nothing is known, and these are all but what the untrained network says
+        others = _like(draw, known.best, (drawn, each))
         best, loss, at, states = jax.tree.map(lambda leaf: leaf[chosen], known)
         at, states, made = jax.vmap(step)(
             jnp.stack(keys), said, others, best, loss, at, states, pictures[chosen]
@@ -176,11 +169,21 @@ def prepare(task: Task) -> Solve:
             known, rendered, within = solve_some(solving, mean, known, rendered, chosen)
             for lesson in jax.random.split(learning, lessons[min(i, rounds - 1)]):
                 y, state = learn(lesson, y, state, known.best, rendered, within)
-                mean = optax.incremental_update(y, mean, TENTH / (TENTH + taught))
+                mean = optax.incremental_update(y, mean, LATE / (LATE + taught))
                 taught += 1
             record(mean)
 
     return solve
+
+
+def _like(key: jax.Array, best: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    """Poses as the best ones are spread: a kernel density estimate by Scott's rule, and clipped."""
+    which, where = jax.random.split(key)
+    width = jnp.std(best, axis=0) * len(best) ** (-1 / (best.shape[1] + 4))
+    poses = jax.random.choice(which, best, shape)
+    poses += width[(None,) * len(shape)] * jax.random.normal(where, poses.shape)
+    low, high = (f(best, axis=0)[(None,) * len(shape)] for f in (jnp.min, jnp.max))
+    return jnp.clip(poses, low, high)
 
 
 def _finite(losses: jax.Array) -> jax.Array:
