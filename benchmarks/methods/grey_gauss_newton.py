@@ -176,14 +176,17 @@ def prepare(task: Task) -> Solve:
     return solve
 
 
-def _like(key: jax.Array, best: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-    """Poses as the best ones are spread: a kernel density estimate by Scott's rule, and clipped."""
+def _like(key: jax.Array, best: jax.Array, shape: tuple[int, int]) -> jax.Array:
+    """Poses as the best ones are spread: a kernel density estimate by Scott's rule, and clipped.
+
+    That of `jax.scipy.stats` says NaN where an entry is the same in all, as it may be at first.
+    """
     which, where = jax.random.split(key)
     width = jnp.std(best, axis=0) * len(best) ** (-1 / (best.shape[1] + 4))
     poses = jax.random.choice(which, best, shape)
-    poses += width[(None,) * len(shape)] * jax.random.normal(where, poses.shape)
-    low, high = (f(best, axis=0)[(None,) * len(shape)] for f in (jnp.min, jnp.max))
-    return jnp.clip(poses, low, high)
+    poses += width[None, None] * jax.random.normal(where, poses.shape)
+    low, high = jnp.min(best, axis=0), jnp.max(best, axis=0)
+    return jnp.clip(poses, low[None, None], high[None, None])
 
 
 def _finite(losses: jax.Array) -> jax.Array:
