@@ -46,7 +46,6 @@ def leave_out(
         index = start + np.arange(count * size).reshape(count, size)
         rows = errors[start : start + count * size].reshape(count, size, -1)
         blocks = block_of(index)
-        # one batched solve at most: several in one program have been seen to hang on a CPU
         solved = rows / blocks if size == 1 else jnp.linalg.solve(blocks, rows)
         parts.append(solved.reshape(count * size, -1))
     return parts[0] if len(parts) == 1 else jnp.concatenate(parts)
