@@ -73,7 +73,8 @@ def test_it_is_algorithm_2(b1, b2, second_moment, x64):
         if second_moment != "none":
             bottom = after(v, theta) if second_moment == "filter" else v.max()
             expected /= jnp.sqrt(bottom / (1 - b2**t)) + 1e-3
-        np.testing.assert_allclose(found, expected, rtol=1e-12)
+        # what is left of differences of numbers near one has their rounding
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14)
         theta -= 0.1 * found
 
 

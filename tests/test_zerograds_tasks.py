@@ -150,7 +150,9 @@ def test_the_loss_is_the_sum_of_the_terms(module):
     y = task.start(0)
     terms = jax.jit(task.terms)(y)
     assert terms.shape == task.support(y).shape
-    assert float(terms.sum()) == pytest.approx(float(jax.jit(task.loss)(y)), rel=1e-5)
+    # rounding walks at random as a sum goes on
+    rounding = np.sqrt(terms.size) * np.finfo(np.float32).eps
+    assert float(terms.sum()) == pytest.approx(float(jax.jit(task.loss)(y)), rel=rounding)
 
 
 @pytest.mark.parametrize("module", [led, wicker, node_graph], ids=name)
