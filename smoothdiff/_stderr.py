@@ -123,7 +123,7 @@ def _spread(batch: Batch, sums: Callable, rows: PyTree, mean: Array, scale: Arra
     safe = jnp.where(scale > 0, scale, 1).astype(mean.dtype)
 
     def deviations(z, log_ratio, valid, rows) -> Array:
-        out = sums(z, log_ratio, rows, jnp.zeros(z.shape, z.dtype)).astype(mean.dtype)
+        out: Array = sums(z, log_ratio, rows, jnp.zeros(z.shape, z.dtype)).astype(mean.dtype)
         away = (out - mean[None]) / safe
         return away if valid is None else jnp.where(valid[:, None], away, 0)
 

@@ -100,12 +100,12 @@ def prepare(task: Task) -> Solve:
                 state.search.history.valid,
             )
         )
-        seen = residuals.reshape(samples, *picture.shape) + picture[None]
+        seen: jax.Array = residuals.reshape(samples, *picture.shape) + picture[None]
         seen = jnp.where(valid[:, None, None, None], seen, jnp.nan)
         return at, state, Rendered(jnp.append(tried, points, 0), jnp.append(shown, seen, 0))
 
     @jax.jit
-    def solve_some(key, y, known, rendered, chosen):
+    def solve_some(key, y, known: Known, rendered: Rendered, chosen):
         """Steps of the solvers of some cases, from whose renders all cases learn."""
         draw, *keys = jax.random.split(key, drawn + 1)
         said = jax.vmap(partial(grey.white, y))(pictures[chosen])
@@ -115,6 +115,7 @@ def prepare(task: Task) -> Solve:
         at, states, made = jax.vmap(step)(
             jnp.stack(keys), said, others, best, loss, at, states, pictures[chosen]
         )
+        points: jax.Array
         points, shown = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), made)
         # nearest by products of matrices, and then as exactly as before
         flat, wanted = shown.reshape(len(shown), -1), pictures.reshape(count, -1)
@@ -134,7 +135,7 @@ def prepare(task: Task) -> Solve:
         return known, rendered, within
 
     @jax.jit
-    def learn(key, y, state, best, rendered, within):
+    def learn(key, y, state, best, rendered: Rendered, within):
         """One lesson on cases and renders that have been drawn, the latter from those within."""
         of_cases, of_renders = jax.random.split(key)
         cases, renders = BATCH

@@ -32,8 +32,9 @@ Kind = Literal["hessian", "product", "aggregate"]
 @jax.jit
 def _move(x, v, g, hv, radius, low, high):
     """One step along v, and its length."""
-    slope, curvature, length = jnp.vdot(g, v), jnp.vdot(v, hv), jnp.linalg.norm(v)
-    far = radius / jnp.maximum(length, jnp.finfo(v.dtype).tiny)
+    slope, curvature = jnp.vdot(g, v), jnp.vdot(v, hv)
+    length = jnp.linalg.norm(v)
+    far: jax.Array = radius / jnp.maximum(length, jnp.finfo(v.dtype).tiny)
     step = -slope / jnp.where(curvature > 0, curvature, 1)
     step = jnp.where(curvature > 0, jnp.clip(step, -far, far), -jnp.sign(slope) * far)
     return jnp.clip(x + step * v, low, high), jnp.abs(step) * length

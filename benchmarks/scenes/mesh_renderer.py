@@ -175,7 +175,8 @@ def _visible(screen: Array, faces: Faces, size: int) -> tuple[Array, Array]:
         triangle = jax.lax.cummax(marks)
         inside_box = places - begins[triangle]
         width = jnp.maximum(spans[triangle, 0], 1)
-        x, y = low[triangle, 0] + inside_box % width, low[triangle, 1] + inside_box // width
+        x: Array = low[triangle, 0] + inside_box % width
+        y: Array = low[triangle, 1] + inside_box // width
         a, b, c = (corners[triangle, i] for i in range(3))
         point = jnp.stack([x, y], axis=1).astype(screen.dtype)
         weights = _barycentric(a, b, c, point)

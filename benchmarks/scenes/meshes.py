@@ -75,7 +75,7 @@ def distance_to_horned(points: Float[Array, "points 3"]) -> Float[Array, " point
         across = jnp.sqrt(jnp.maximum(jnp.sum(points**2, axis=1) - along**2, 0))
         # a cone that touches a ball at either end; its half angle has the sine:
         sine = (ROOT - TIP) / length
-        cosine = (1 - sine**2) ** 0.5
+        cosine: float = (1 - sine**2) ** 0.5
         where = cosine * along - sine * across
         cone = cosine * across + sine * along - ROOT
         tip = jnp.hypot(across, along - length) - TIP

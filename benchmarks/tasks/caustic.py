@@ -92,6 +92,8 @@ def draw(y: Float[Array, "32 32"], rays: int, pixels: int) -> Float[Array, "pixe
     @jax.custom_batching.sequential_vmap  # pictures at once take eight times as long
     def one(y: Float[Array, "32 32"]) -> Float[Array, "pixels pixels"]:
         middles = (np.arange(rays) + 0.5) / rays
+        column: Array
+        row: Array
         column, row = jnp.floor(land(y, middles) * pixels).astype(jnp.int32)
         inside = (column >= 0) & (column < pixels) & (row >= 0) & (row < pixels)
         pixel = jnp.where(inside, row * pixels + column, pixels**2)

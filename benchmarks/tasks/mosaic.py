@@ -69,6 +69,8 @@ def draw(y: Float[Array, "320"]) -> Float[Array, "48 100 3"]:
     leave = jnp.minimum(jnp.minimum(left_end, right_end), floor)
     seen = (enter < leave) & of_line(THERE).astype(bool)
     shade = jnp.where(top > side, SHADES[2], jnp.where(right > left, SHADES[1], SHADES[0]))
+    near: Array
+    far: Array
     near, far = shade[..., None] * of_cube(number(COLOURS))[..., None, :]
     dark = jnp.where(seen[1, ..., None], far, FLOOR)
     return jnp.where(seen[0, ..., None], near, dark).reshape(*BY_PIXEL, 3).mean((1, 3))

@@ -172,6 +172,7 @@ def judge(
     cancel from the comparison. A candidate without a finite estimate loses; ties go to the first.
     """
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *candidates)
+    funs: Array
     funs, stderrs = jax.lax.map(estimate, stacked)
     winner = jnp.argmin(jnp.where(jnp.isfinite(funs), funs, jnp.inf))
     return jax.tree.map(lambda leaf: leaf[winner], stacked), funs[winner], stderrs[winner]

@@ -106,7 +106,7 @@ def _damped(slopes: Array, here: Array) -> Array:
     """The steps, in the space of the first directions of a bidiagonalisation."""
 
     def unit(x: Array) -> tuple[Array, Array]:
-        length = jnp.linalg.norm(x)
+        length: Array = jnp.linalg.norm(x)
         return x / jnp.where(length > 0, length, 1), length
 
     left, size = unit(here)

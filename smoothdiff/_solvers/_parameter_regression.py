@@ -57,6 +57,7 @@ def gauss_newton_step(
     active = ((low >= 0) & (slope > 0)) | ((high <= 0) & (slope < 0))
 
     def regress(carry: tuple) -> tuple:
+        held: Array
         held, _, active, _, times = carry
         moved = _move(gram, u, weight, held, active)
         step, stderr = _regress(moved, jnp.where(active[None], 0, u), weight)
@@ -138,6 +139,7 @@ def _svd(u: Array) -> tuple[Array, Array, Array]:
         kept = s > eps * s[0]
     else:
         # of many parameters by the Gram matrix: several times as fast, at half of the digits
+        squares: Array
         squares, left = jnp.linalg.eigh(dot(u, u.T))
         kept = squares > eps * squares[-1]
         s = jnp.sqrt(jnp.where(kept, squares, 1))

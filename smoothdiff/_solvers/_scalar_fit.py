@@ -196,7 +196,7 @@ def fit(
     choices = [(*shares, ridge) for ridge in _RIDGES[dtype.name] for shares in _SHARES]
     table = jnp.asarray(choices, dtype)
     # one after the other, as LAPACK takes them anyway: a vmap would hold all matrices at once
-    evidence = jax.lax.map(lambda choice: solve(choice)[0], table)
+    evidence: Array = jax.lax.map(lambda choice: solve(choice)[0], table)
     choice = table[jnp.argmax(jnp.where(jnp.isfinite(evidence), evidence, -jnp.inf))]
     _, left, constant, misfit, factor = solve(choice)
     return ScalarFit(

@@ -172,7 +172,7 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
         take_apart(y, sigma_at(self.sigma, step), bounds)
         return FirstOrderState(Progress.start(y, f_struct.dtype), self.optim.init(y), y, step)
 
-    def step(self, fn, y, args, options, state, tags):
+    def step(self, fn, y, args, options, state: FirstOrderState, tags):
         """One batch, one update."""
         progress = state.progress
         estimate = self._estimator(fn, args, progress.step, options)

@@ -203,7 +203,7 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         one, none = jnp.ones((), dtype), jnp.zeros((), jnp.int32)
         return LocalGaussNewtonState(Progress.start(y, dtype), one, none)
 
-    def step(self, fn, y, args, options, state, tags):
+    def step(self, fn, y, args, options, state: LocalGaussNewtonState, tags):
         """One batch, one step in each place, the best of nine ends."""
         progress = state.progress
         params = smoothed_params(self, y, progress.step, options)

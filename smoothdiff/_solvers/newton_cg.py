@@ -208,7 +208,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         restarts = Restarts.start(self.restarts, theta, (metric, search.trust.width))
         return NewtonCGState(Progress.start(y, f_struct.dtype), search, restarts)
 
-    def step(self, fn, y, args, options, state, tags):
+    def step(self, fn, y, args, options, state: NewtonCGState, tags):
         """One batch, one Newton step from all samples that are kept."""
         progress, search, trust = state.progress, state.search, state.search.trust
         params = smoothed_params(self, y, progress.step, options)

@@ -272,7 +272,7 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
         surrogate, fit = eqx.combine(state.fit.weights, rest), state.fit
         return lambda y: fit.value(surrogate, params.layout.vector(jax.tree.leaves(y)))
 
-    def step(self, fn, y, args, options, state, tags):
+    def step(self, fn, y, args, options, state: ZeroGradsState, tags):
         """One batch, updates of the surrogate on it, and of the parameters on the surrogate."""
         progress = state.progress
         params = smoothed_params(self, y, progress.step, options)
