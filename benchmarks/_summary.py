@@ -1,4 +1,4 @@
-"""From runs to numbers: medians and quartiles over the starts, of errors and of what they took.
+"""From runs to numbers: what each method took from each start, and curves with their spread.
 
 Errors are relative to those of the start. A level of 99 % is reached at the first point of a run
 whose error is at most 1 % of the start's. Where the lowest value of the loss is known, there is
@@ -7,78 +7,83 @@ median is infinite when half of the runs do not get there.
 """
 
 import math
-import os
-import platform
 from collections.abc import Sequence
-from importlib import metadata
 from typing import Any
 
 import jax
 import numpy as np
 
-from benchmarks._harness import CLOSED, Run
-from benchmarks._task import Method, NotAble, Task
+from benchmarks._loop import CLOSED, Run, Runs
+from benchmarks._study import rounded
+from benchmarks._task import NotAble, Task
 
 REDUCTIONS = {"90": 0.1, "99": 0.01, "99.9": 0.001}  # in percent
 GAPS = {"1e0": 1.0, "1e-3": 1e-3, "1e-8": CLOSED}
 LEVELS = {"image_error": REDUCTIONS, "parameter_error": REDUCTIONS, "gap": GAPS}
 COSTS = ("evaluations", "seconds")
-PACKAGES = (
-    *("smoothdiff", "jax", "jaxlib", "optax", "optimistix", "equinox", "lineax", "numpy", "scipy"),
-    *("mitsuba", "coco-experiment", "cma", "evosax", "jaxopt", "Py-BOBYQA", "pygad"),
-)
+POINTS = 40  # of a curve
+DIGITS = 3  # of a number in a curve: a line in a picture needs no more
 
 
-def summarise(
-    task: Task, runs: dict[Method, list[Run] | NotAble], setting: str, command: str
-) -> dict[str, Any]:
-    """What is written to results.json."""
+def summarise(task: Task, runs: Runs) -> dict[str, Any]:
+    """What results.json says of a task."""
     return {
-        "task": task.name,
         "title": task.title,
-        "setting": setting,
         "notes": task.notes,
-        "budget": task.budget._asdict(),
-        "sigma": task.sigma,
-        "dimensions": sum(np.size(leaf) for leaf in jax.tree.leaves(task.reference)),
-        "command": command,
-        "machine": machine(),
+        "budget": task.problem.budget._asdict(),
+        "sigma": task.problem.sigma,
+        "dimensions": sum(np.size(leaf) for leaf in jax.tree.leaves(task.problem.like)),
         "methods": {
             method.name: {"title": method.title}
-            | ({"not_able": str(found)} if isinstance(found, NotAble) else _of_method(found))
+            | ({"not_able": str(found)} if isinstance(found, NotAble) else of_runs(found))
             for method, found in runs.items()
         },
     }
 
 
-def _of_method(runs: list[Run]) -> dict[str, Any]:
+def of_runs(runs: list[Run]) -> dict[str, Any]:
+    """What the runs of one method took and left, as quartiles over the starts, and their curves."""
+    errors = [error for error in LEVELS if error in runs[0]]
     return {
         "starts": len(runs),
         "warm_up_seconds": runs[0]["warm_up_seconds"],
         "distance": quartiles([run["distance"] for run in runs]),
-        **{
-            error: {
-                "final": quartiles([run[error][-1] for run in runs]),
-                "levels": {
-                    name: _level(runs, error, level) for name, level in LEVELS[error].items()
-                },
-            }
-            for error in LEVELS
-            if error in runs[0]
+        "first": float(runs[0]["image_error"][-1]),  # what the first start, which is pictured, left
+        "final": {error: quartiles([float(run[error][-1]) for run in runs]) for error in errors},
+        "took": {
+            error: {name: took(runs, error, level) for name, level in LEVELS[error].items()}
+            for error in errors
         },
-        "runs": [{k: v for k, v in run.items() if k != "fingerprint"} for run in runs],
+        "curves": {error: {cost: curve(runs, error, cost) for cost in COSTS} for error in errors},
     }
 
 
-def _level(runs: list[Run], error: str, level: float) -> dict[str, Any]:
+def took(runs: list[Run], error: str, level: float) -> dict[str, Any]:
+    """From how many starts a level is reached, and quartiles of what that costs."""
     costs = {cost: [cost_to_level(run[error], run[cost], level) for run in runs] for cost in COSTS}
     solved = sum(math.isfinite(cost) for cost in costs["evaluations"])
     return {"solved": solved} | {cost: quartiles(values) for cost, values in costs.items()}
 
 
+def curve(runs: list[Run], error: str, cost: str) -> dict[str, Any]:
+    """Quartiles of an error at costs that are even in the logarithm; none of a run of one point."""
+    costs = np.concatenate([run[cost] for run in runs])
+    if not costs.any():  # it gave up at once
+        return {"ends": None, "quartiles": []}
+    ends = float(costs[costs > 0].min()), float(costs.max())
+    found = band(runs, error, cost, grid(ends))
+    return {"ends": ends, "quartiles": rounded(found.tolist(), DIGITS)}
+
+
+def grid(ends: Sequence[float]) -> np.ndarray:
+    """The costs of the points of a curve between its ends."""
+    return np.geomspace(ends[0], ends[1], POINTS)
+
+
 def cost_to_level(errors: Sequence[float], costs: Sequence[float], level: float) -> float:
     """The cost at which the error is first at most `level`; infinite if it never is."""
-    return next((c for e, c in zip(errors, costs, strict=True) if e <= level), math.inf)
+    found = (float(c) for e, c in zip(errors, costs, strict=True) if e <= level)
+    return next(found, math.inf)
 
 
 def quartiles(values: Sequence[float]) -> dict[str, float | None]:
@@ -92,35 +97,16 @@ def quartiles(values: Sequence[float]) -> dict[str, float | None]:
     return dict(zip(("median", "lower", "upper"), found, strict=True))
 
 
-def band(runs: list[Run], error: str, cost: str, grid: np.ndarray) -> np.ndarray:
-    """Quartiles of the error over the runs, at each cost of the grid, (3, grid)."""
+def band(runs: list[Run], error: str, cost: str, costs: np.ndarray) -> np.ndarray:
+    """Quartiles of the error over the runs, at each of the costs, (3, costs)."""
     errors = []
     for run in runs:
-        last = np.searchsorted(run[cost], grid, side="right") - 1  # a run stays where it stopped
+        # a run stays where it stopped
+        last = np.searchsorted(run[cost], costs * (1 + 1e-9), side="right") - 1
         errors.append(np.asarray(run[error])[last])
     return np.quantile(errors, [0.25, 0.5, 0.75], axis=0)
 
 
-def machine() -> dict[str, Any]:
-    """Where the numbers come from."""
-    versions = {}
-    for package in PACKAGES:
-        try:
-            versions[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            continue
-    return {
-        "platform": platform.platform(),
-        "cpu": _cpu(),
-        "cores": os.cpu_count(),
-        "python": platform.python_version(),
-        "versions": versions,
-    }
-
-
-def _cpu() -> str:
-    try:
-        with open("/proc/cpuinfo") as lines:
-            return next(line.split(":")[1].strip() for line in lines if "model name" in line)
-    except (OSError, StopIteration):
-        return platform.processor()
+def able(task: dict[str, Any]) -> dict[str, Any]:
+    """The methods that ran on a task, by its results."""
+    return {name: found for name, found in task["methods"].items() if "took" in found}

@@ -1,12 +1,12 @@
-"""What a task is: a black box to minimise, where to start, and what counts as found.
+"""What a task is: the problem that a method sees, and the score that it does not see.
 
-A method sees a task, prepares itself for it once, and is then run from several starts. It tells the
-harness where it is after each iteration and is stopped by it.
+A method prepares itself for a problem once, and is then run from several starts. It tells the loop
+where it is after each iteration and is stopped by it.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import jax
@@ -15,9 +15,10 @@ import jax.numpy as jnp
 Y: TypeAlias = Any  # the parameters: an array or a pytree of arrays
 Key: TypeAlias = jax.Array
 Loss: TypeAlias = Callable[[Y], jax.Array]
-Record: TypeAlias = Callable[[Y], None]
+Record: TypeAlias = Callable[..., None]
 Solve: TypeAlias = Callable[[Y, Key, Record], None]
 NativeAD: TypeAlias = Callable[[Y], tuple[Any, Y]]
+Kind: TypeAlias = Literal["function", "program", "scene", "large", "network", "descent"]
 
 
 class NotAble(Exception):
@@ -57,39 +58,97 @@ class Grey(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
-    """A black box to minimise.
+class Problem:
+    """What a method sees. Whatever evaluates the black box is counted.
 
-    A task is written in coordinates in which one sigma fits all parameters, so that a method needs
-    to know nothing else about the units.
+    It is written in coordinates in which one sigma fits all parameters, so that a method needs to
+    know nothing else about the units.
 
     Args:
-        name: The name on the command line and of the folder of results.
-        title: What is sought, in one line.
-        loss: The black box that is optimised, a JAX function y -> scalar. Each call is counted.
-        exact_loss: The loss without noise, for the score only. Not counted.
-        start: The start of a seed, seed -> y.
-        reference: The y that is sought.
         bounds: (low, high), each like y.
         sigma: The scale of the parameters: about how far one has to look around.
         budget: Where a run ends.
-        seeds: How many starts there are.
-        image: A picture of y without noise, y -> (H, W, 3) linear RGB, or None. Not counted.
-        native_ad: Gives y -> (loss, gradient) by the renderer's own AD, or None. It raises NotAble
-            where that cannot run.
+        loss: The black box, a JAX function y -> scalar. By default the mean of the squared
+            residuals, or the grey box's.
         residuals: y -> array, such that the loss is the sum or the mean of its squares, or None: a
             picture minus its reference, say. A call is counted like a call of the loss.
         terms: y -> array, such that the loss is the sum of its entries, with `support`; or None. A
             call is counted likewise.
         support: Which of the terms a parameter may influence, as for `smoothdiff.smooth`. Then the
             first axes of the residuals are those of the terms.
-        grey: The loss in two parts, for methods that use AD where they can; or None. With it, the
-            loss is that of these parts, and costs an evaluation for each case.
+        grey: The loss in two parts, for methods that use AD where they can; or None. The loss then
+            costs an evaluation for each case.
+        native_ad: Gives y -> (loss, gradient) by the renderer's own AD, or None. It raises NotAble
+            where that cannot run.
+        gradient: (y, key, scene) -> gradient, as noisy as it is, for problems that come with
+            gradients; or None. Then an iteration counts as an evaluation.
+        scene: Gives what the seed decides, or what is too large to be a constant of a compiled
+            program, a pytree of arrays.
+    """
+
+    bounds: tuple[Y, Y]
+    sigma: float
+    budget: Budget
+    loss: Loss = None  # type: ignore[assignment]
+    residuals: Callable[[Y], jax.Array] | None = None
+    terms: Callable[[Y], jax.Array] | None = None
+    support: Any = None
+    grey: Grey | None = None
+    native_ad: Callable[[], NativeAD] | None = None
+    gradient: Callable[[Y, Key, Any], Y] | None = None
+    scene: Callable[[], Any] = lambda: None
+
+    def __post_init__(self):
+        residuals, grey = self.residuals, self.grey
+        if self.loss is None and grey is not None:
+            object.__setattr__(self, "loss", grey.loss)
+        elif self.loss is None and residuals is not None:
+            object.__setattr__(self, "loss", lambda y: jnp.mean(residuals(y) ** 2))
+
+    @property
+    def like(self) -> Y:
+        """Something like y: the lower bounds."""
+        return self.bounds[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """How what was found is scored; nothing of it is counted or seen by a method.
+
+    Args:
+        reference: The y that is sought.
+        loss: The loss without noise, or None where the problem's has none.
+        image: A picture of y without noise, y -> (H, W, 3) linear RGB, or None.
         distance: How far y is from what is sought, y -> number, where that is not the length of
             their difference: wrong switches, or the poses that a network says. Or None.
-        precision: What the task is run in; all of its functions are called in it.
         optimum: The lowest value of the loss, or None. With it, runs are also scored by how far
             above it they are.
+        errors: Errors by name, (y, scene) -> numbers, in place of those of image and parameters;
+            or None.
+        levels: What runs are asked to get each error down to, by its name; for `errors`.
+    """
+
+    reference: Y = None
+    loss: Loss | None = None
+    image: Callable[[Y], jax.Array] | None = None
+    distance: Callable[[Y], jax.Array] | None = None
+    optimum: float | None = None
+    errors: Callable[[Y, Any], Mapping[str, jax.Array]] | None = None
+    levels: Mapping[str, Sequence[float]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A black box to minimise: what is seen of it, how it is scored, and where runs begin.
+
+    Args:
+        name: The name on the command line and of the folder of results.
+        title: What is sought, in one line.
+        problem: What a method sees.
+        score: How what it finds is scored.
+        start: The start of a seed, seed -> y.
+        seeds: How many starts there are.
+        precision: What the task is run in; all of its functions are called in it.
         choose: Makes the black box that of a seed, and returns the y that is sought then; or None
             where it is the same for all seeds.
         dearer: The picture by dearer renders, by the name of the saving that each does without; ""
@@ -99,26 +158,53 @@ class Task:
 
     name: str
     title: str
-    loss: Loss
-    exact_loss: Loss
+    problem: Problem
+    score: Score
     start: Callable[[int], Y]
-    reference: Y
-    bounds: tuple[Y, Y]
-    sigma: float
-    budget: Budget
     seeds: int
-    image: Callable[[Y], jax.Array] | None = None
-    native_ad: Callable[[], NativeAD] | None = None
-    residuals: Callable[[Y], jax.Array] | None = None
-    terms: Callable[[Y], jax.Array] | None = None
-    support: Callable[[Y], Any] | None = None
-    grey: Grey | None = None
-    distance: Callable[[Y], jax.Array] | None = None
     precision: Literal["float32", "float64"] = "float32"
-    optimum: float | None = None
     choose: Callable[[int], Y] | None = None
     dearer: Callable[[], dict[str, Callable[[Y], jax.Array]]] | None = None
     notes: str = ""
+
+    @property
+    def exact_loss(self) -> Loss:
+        """The loss without noise."""
+        return self.score.loss or self.problem.loss
+
+
+class Method(NamedTuple):
+    """A way to solve problems: `prepare(problem)` gives `solve(y0, key, record)`.
+
+    What is compiled lives in `prepare`, so that it is compiled once for all starts. `solve` calls
+    `record(y)` after each iteration and runs until record ends it, or until it has converged. On
+    a problem that comes with gradients it calls `record(y, iterations)`.
+    """
+
+    name: str
+    title: str
+    prepare: Callable[[Problem], Solve]
+    source: str  # a change of it makes earlier results stale
+
+
+class TaskEntry(NamedTuple):
+    """A line of a module's TASKS: what is sought, of which kind it is, and how it is built.
+
+    `build(full)` gives a Task, or a list of them where one name stands for a family, such as a
+    function in several dimensions; they are named "function-5d".
+    """
+
+    title: str
+    kind: Kind
+    build: Callable[..., Task | list[Task]]
+
+
+class MethodEntry(NamedTuple):
+    """A line of a module's METHODS: its title, and the kinds of tasks that it runs on unasked."""
+
+    title: str
+    kinds: tuple[Kind, ...]
+    prepare: Callable[[Problem], Solve]
 
 
 @contextmanager
@@ -134,16 +220,3 @@ def precision_of(task: Task) -> Iterator[None]:
         yield
     finally:
         jax.config.update("jax_enable_x64", before)
-
-
-class Method(NamedTuple):
-    """A way to solve tasks: `prepare(task)` gives `solve(y0, key, record)`.
-
-    What is compiled lives in `prepare`, so that it is compiled once for all starts. `solve` calls
-    `record(y)` after each iteration and runs until record ends it, or until it has converged.
-    """
-
-    name: str
-    title: str
-    prepare: Callable[[Task], Solve]
-    source: str  # a change of it makes earlier results stale

@@ -8,33 +8,29 @@ from collections.abc import Callable
 import jax
 import optax
 
-from benchmarks._task import Solve, Task, Y
+from benchmarks._task import Key, Problem, Solve
+from benchmarks.methods._flat import Flat
 
-LEARNING_RATE = 0.15  # in units of the task's sigma
+LEARNING_RATE = 0.15  # in units of the problem's sigma
 DECAY = 0.02  # what is left of it at the end
 
 
-def optimiser(task: Task, evaluations_per_step: int) -> optax.GradientTransformation:
-    """Adam for a task, for a method that spends so many evaluations on a step."""
-    steps = task.budget.evaluations // evaluations_per_step
-    rate = LEARNING_RATE * task.sigma
+def optimiser(problem: Problem, evaluations_per_step: int) -> optax.GradientTransformation:
+    """Adam for a problem, for a method that spends so many evaluations on a step."""
+    steps = problem.budget.evaluations // evaluations_per_step
+    rate = LEARNING_RATE * problem.sigma
     return optax.adam(optax.linear_schedule(rate, DECAY * rate, steps))
 
 
-def adam(task: Task, gradient: Callable[[Y], Y], evaluations_per_step: int) -> Solve:
-    """Adam on `gradient(y)`, projected to the bounds: for methods without a loop of their own."""
-    optim = optimiser(task, evaluations_per_step)
+def adam(
+    flat: Flat, gradient: Callable[[Key, int, jax.Array], jax.Array], evaluations_per_step: int
+) -> Solve:
+    """Adam on `gradient(key, i, x)` of step i, within the bounds; it is called as it is."""
+    optim = optimiser(flat.problem, evaluations_per_step)
 
     @jax.jit
-    def update(y, state, grad):
-        updates, state = optim.update(grad, state, y)
-        y = optax.projections.projection_box(optax.apply_updates(y, updates), *task.bounds)
-        return y, state
+    def move(x, state, slope):
+        updates, state = optim.update(slope, state, x)
+        return flat.clip(x + updates), state
 
-    def solve(y0, key, record):
-        y, state = y0, optim.init(y0)
-        while True:
-            y, state = update(y, state, gradient(y))
-            record(y)
-
-    return solve
+    return flat.iterate(lambda key, i, x, state: move(x, state, gradient(key, i, x)), optim.init)

@@ -1,36 +1,41 @@
-"""A task as a function of one vector within bounds, as the libraries of optimisers see it."""
+"""A problem as a function of one vector within bounds, as optimisers see it; and their loop."""
 
 import importlib
+import itertools
 import warnings
+from collections.abc import Callable
 from types import ModuleType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from benchmarks._task import NotAble, Record, Task, Y
+from benchmarks._task import Key, NotAble, Problem, Solve, Y
 
 
 class Flat:
-    """The loss, the start and the bounds of a task in flat vectors. The loss sees clipped points.
+    """The loss, the start and the bounds of a problem in vectors. The loss sees clipped points.
 
     Attributes:
+        problem: The problem.
         size: The number of parameters.
         dtype: Their type.
         low: Their lower bounds, a vector.
         high: Their upper bounds.
+        box: Both in NumPy's double precision, two rows.
+        unravel: The parameters as the problem has them, as they are.
         value: vector -> number, compiled.
         values: rows -> numbers, compiled, in one call.
     """
 
-    def __init__(self, task: Task):
-        reference, self._unravel = ravel_pytree(task.reference)
-        self.size, self.dtype = reference.size, reference.dtype
-        self.low, self.high = (
-            ravel_pytree(jax.tree.map(_fill, task.reference, bound))[0] for bound in task.bounds
-        )
-        self._loss = task.loss
+    def __init__(self, problem: Problem):
+        self.problem = problem
+        self.low, self.unravel = ravel_pytree(problem.like)
+        self.high, _ = ravel_pytree(problem.bounds[1])
+        self.size, self.dtype = self.low.size, self.low.dtype
+        self.box = np.asarray([self.low, self.high], float)
         self.value = jax.jit(self.loss)
         self.values = jax.jit(jax.vmap(self.loss))
 
@@ -43,31 +48,38 @@ class Flat:
         return jnp.clip(x, self.low, self.high)
 
     def tree(self, x: jax.Array | np.ndarray) -> Y:
-        """The parameters as the task has them, within the bounds."""
-        return self._unravel(self.clip(jnp.asarray(x, self.dtype)))
+        """The parameters as the problem has them, within the bounds."""
+        return self.unravel(self.clip(jnp.asarray(x, self.dtype)))
 
     def loss(self, x: jax.Array) -> jax.Array:
         """The loss of a vector; can be traced."""
-        return self._loss(self.tree(x))
+        return self.problem.loss(self.tree(x))
+
+    def batch(self, points: Any) -> np.ndarray:
+        """The losses of NumPy's rows, in double precision."""
+        return np.asarray(self.values(np.asarray(points, self.dtype)), float)
+
+    def iterate(self, step: Callable, init: Callable[[jax.Array], Any]) -> Solve:
+        """The loop of `x, state = step(key, i, x, state)`, where x is recorded; i counts from 0.
+
+        Args:
+            step: Each call has a key of its own.
+            init: The first state, of the start.
+        """
+
+        def solve(y0, key, record):
+            x = jnp.asarray(self.start(y0), self.dtype)
+            state = init(x)
+            for i in itertools.count():
+                x, state = step(jax.random.fold_in(key, i), i, x, state)
+                record(self.tree(x))
+
+        return solve
 
 
-class OneByOne:
-    """The loss for libraries on the host: a number for a vector, recorded after each evaluation.
-
-    What it records is the best point so far, by what the evaluations said.
-    """
-
-    def __init__(self, flat: Flat, record: Record):
-        self._flat, self._record = flat, record
-        self._lowest, self._best = np.inf, None
-
-    def __call__(self, x: np.ndarray) -> float:
-        """Evaluates one point."""
-        value = float(self._flat.value(np.asarray(x, self._flat.dtype)))
-        if self._best is None or value < self._lowest:
-            self._lowest, self._best = value, self._flat.tree(x)
-        self._record(self._best)
-        return value
+def seed_of(key: Key) -> int:
+    """A seed for random numbers that are not JAX's."""
+    return int(jax.random.randint(key, (), 1, 2**31 - 1))
 
 
 def package(module: str, install: str) -> ModuleType:
@@ -77,8 +89,3 @@ def package(module: str, install: str) -> ModuleType:
             return importlib.import_module(module)
     except ImportError as error:
         raise NotAble(f"needs a package: pip install {install}") from error
-
-
-def _fill(leaf: jax.Array, bound: jax.Array) -> jax.Array:
-    leaf = jnp.asarray(leaf)
-    return jnp.broadcast_to(jnp.asarray(bound, leaf.dtype), leaf.shape)

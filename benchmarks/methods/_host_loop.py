@@ -6,11 +6,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from benchmarks._task import Solve, Task, Y
+from benchmarks._task import Problem, Solve, Y
 from smoothdiff import Record
 
 
-def run_by(minimise: Callable, task: Task, fun: Callable[[Y], Any], solver: Any) -> Solve:
+def run_by(minimise: Callable, problem: Problem, fun: Callable[[Y], Any], solver: Any) -> Solve:
     """The solver on a function of y, compiled once for all starts."""
 
     def with_args(y, args):
@@ -23,8 +23,8 @@ def run_by(minimise: Callable, task: Task, fun: Callable[[Y], Any], solver: Any)
             y0,
             key=key,
             solver=solver,
-            max_evaluations=task.budget.evaluations,
-            bounds=task.bounds,
+            max_evaluations=problem.budget.evaluations,
+            bounds=problem.bounds,
             callback=lambda step: record(best.after(step)),
         )
         if result.reason == "interrupted":

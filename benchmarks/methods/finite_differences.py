@@ -6,29 +6,36 @@ sees the noise of the render instead, and stays on the plateau from some.
 
 import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
 
-from benchmarks._task import Solve, Task
+from benchmarks._task import MethodEntry, NotAble, Problem, Solve
 from benchmarks.methods._adam import adam
+from benchmarks.methods._flat import Flat
 
-TITLE = "Finite differences, Adam"
-STEP = 0.3  # in units of the task's sigma
+STEP = 0.3  # in units of the problem's sigma
 BATCH = 64  # parameters at once, which bounds the memory
 
 
-def prepare(task: Task) -> Solve:
-    """Central differences need nothing but the loss."""
-    reference, unravel = ravel_pytree(task.reference)
-    step = STEP * task.sigma
+def prepare(problem: Problem) -> Solve:
+    """Central differences need nothing but the loss, also beyond the bounds."""
+    flat, step = Flat(problem), STEP * problem.sigma
+    evaluations = 2 * flat.size
+    if evaluations > problem.budget.evaluations:
+        raise NotAble(f"needs {evaluations:,} evaluations for its first step")
 
     @jax.jit
-    def gradient(y):
-        flat, _ = ravel_pytree(y)
-
+    def gradient(x):
         def slope(i):
-            forward, backward = (task.loss(unravel(flat.at[i].add(h))) for h in (step, -step))
+            shifted = (flat.unravel(x.at[i].add(shift)) for shift in (step, -step))
+            forward, backward = map(problem.loss, shifted)
             return (forward - backward) / (2 * step)
 
-        return unravel(jax.lax.map(slope, jnp.arange(flat.size), batch_size=BATCH))
+        return jax.lax.map(slope, jnp.arange(flat.size), batch_size=BATCH)
 
-    return adam(task, gradient, evaluations_per_step=2 * reference.size)
+    return adam(flat, lambda key, i, x: gradient(x), evaluations)
+
+
+METHODS = {
+    "finite_differences": MethodEntry(
+        "Finite differences, Adam", ("scene", "program", "function"), prepare
+    )
+}

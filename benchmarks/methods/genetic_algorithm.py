@@ -5,36 +5,33 @@ The first population is the start and normal samples around it; mutations are up
 
 import logging
 
-import jax
 import numpy as np
 
-from benchmarks._task import NotAble, Solve, Task
-from benchmarks.methods._flat import Flat, package
+from benchmarks._task import MethodEntry, NotAble, Problem, Solve
+from benchmarks.methods._flat import Flat, package, seed_of
 
-TITLE = "Genetic algorithm (PyGAD)"
 POPULATION = 50
 PARENTS = 10
 MOST = 100_000  # parameters: PyGAD goes through them one by one
 SILENT = logging.Logger("silent", logging.CRITICAL + 1)  # it would log how record ends a run
 
 
-def prepare(task: Task) -> Solve:
+def prepare(problem: Problem) -> Solve:
     """Evaluates a whole generation in one call."""
-    pygad = package("pygad", "pygad")
-    flat = Flat(task)
+    pygad, flat = package("pygad", "pygad"), Flat(problem)
     if flat.size > MOST:
         raise NotAble(f"takes minutes for a generation of more than {MOST} parameters")
 
     def solve(y0, key, record):
-        seed = int(jax.random.randint(key, (), 1, 2**31 - 1))
-        start = flat.start(y0)
-        population = np.random.default_rng(seed).normal(start, task.sigma, (POPULATION, flat.size))
+        seed, start = seed_of(key), flat.start(y0)
+        random = np.random.default_rng(seed)
+        population = random.normal(start, problem.sigma, (POPULATION, flat.size))
         population[0] = start
         lowest, shown = np.inf, y0
 
         def fitness(_, genes, indices):
             nonlocal lowest, shown
-            values = np.asarray(flat.values(np.asarray(genes, flat.dtype)), float)
+            values = flat.batch(genes)
             if values.min() < lowest:
                 lowest, shown = values.min(), flat.tree(genes[values.argmin()])
             return (-values).tolist()
@@ -44,9 +41,9 @@ def prepare(task: Task) -> Solve:
             num_parents_mating=PARENTS,
             fitness_func=fitness,
             fitness_batch_size=POPULATION,
-            initial_population=np.clip(population, flat.low, flat.high),
-            random_mutation_min_val=-task.sigma,
-            random_mutation_max_val=task.sigma,
+            initial_population=np.clip(population, *flat.box),
+            random_mutation_min_val=-problem.sigma,
+            random_mutation_max_val=problem.sigma,
             on_generation=lambda _: record(shown),
             random_seed=seed,
             suppress_warnings=True,
@@ -54,3 +51,8 @@ def prepare(task: Task) -> Solve:
         ).run()
 
     return solve
+
+
+METHODS = {
+    "genetic_algorithm": MethodEntry("Genetic algorithm (PyGAD)", ("scene", "program"), prepare)
+}

@@ -5,7 +5,6 @@ pulled back through the network to its weights. A step sees a few cases, and eac
 of its own. Estimators differ in nothing else; sigma is annealed as in the papers (Table 3).
 """
 
-import itertools
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -15,7 +14,8 @@ import jax.numpy as jnp
 import optax
 
 import smoothdiff as sd
-from benchmarks._task import Grey, NotAble, Solve, Task
+from benchmarks._task import MethodEntry, NotAble, Problem, Solve
+from benchmarks.methods._flat import Flat
 
 BATCH = 8  # cases in a step
 RATE, DECAY = 1e-3, 0.02  # of Adam on the weights, and what is left of it at the end
@@ -26,32 +26,28 @@ Estimate = Callable[..., jax.Array]  # (black, sigma, key, x, case) -> the slope
 Cost = Callable[[int], int]  # evaluations for so many parameters
 
 
-def prepare(task: Task, estimate: Estimate, cost: Cost) -> Solve:
+def prepare(problem: Problem, estimate: Estimate, cost: Cost) -> Solve:
     """Compiles a step."""
-    if task.grey is None:
+    grey = problem.grey
+    if grey is None:
         raise NotAble("this task has no part that AD knows")
-    grey: Grey = task.grey
-    parameters = jax.eval_shape(grey.white, task.reference, grey.cases[0]).size
-    steps = task.budget.evaluations // (BATCH * cost(parameters))
+    flat = Flat(problem)
+    parameters = jax.eval_shape(grey.white, problem.like, grey.cases[0]).size
+    steps = problem.budget.evaluations // (BATCH * cost(parameters))
     optim = optax.adam(optax.linear_schedule(RATE, DECAY * RATE, steps))
     sigma_at = optax.linear_schedule(grey.sigma, SIGMA_END * grey.sigma, steps)
 
     @jax.jit
-    def step(key: jax.Array, y: jax.Array, state: Any, i: jax.Array) -> tuple[Any, Any]:
-        draw, *keys = jax.random.split(jax.random.fold_in(key, i), BATCH + 1)
+    def step(key: jax.Array, i: jax.Array, x: jax.Array, state: Any) -> tuple[Any, Any]:
+        draw, *keys = jax.random.split(key, BATCH + 1)
         cases = jax.random.choice(draw, grey.cases, (BATCH,), replace=False)
-        inner, pull = jax.vjp(lambda y: jax.vmap(partial(grey.white, y))(cases), y)
+        white = lambda x: jax.vmap(partial(grey.white, flat.unravel(x)))(cases)
+        inner, pull = jax.vjp(white, x)
         slopes = jax.vmap(partial(estimate, grey.black, sigma_at(i)))(jnp.stack(keys), inner, cases)
-        updates, state = optim.update(pull(slopes / BATCH)[0], state, y)
-        return optax.apply_updates(y, updates), state
+        updates, state = optim.update(pull(slopes / BATCH)[0], state, x)
+        return optax.apply_updates(x, updates), state
 
-    def solve(y0, key, record):
-        y, state = y0, optim.init(y0)
-        for i in itertools.count():
-            y, state = step(key, y, state, jnp.asarray(i))
-            record(y)
-
-    return solve
+    return flat.iterate(step, optim.init)
 
 
 def _smoothed(**options: Any) -> Estimate:
@@ -71,31 +67,18 @@ def _differences(black, sigma, key, x, case):
     return jax.vmap(slope)(jnp.eye(x.size, dtype=x.dtype))
 
 
-def _variant(title: str, estimate: Estimate, cost: Cost) -> tuple[str, Callable[[Task], Solve]]:
-    return title, partial(prepare, estimate=estimate, cost=cost)
+def _entry(estimator: str, estimate: Estimate, cost: Cost) -> MethodEntry:
+    title = f"Network by AD, renderer by {estimator}"
+    return MethodEntry(title, ("network",), partial(prepare, estimate=estimate, cost=cost))
 
 
-PAIR = {"num_samples": 2, "baseline": "none"}
-VARIANTS = {
-    "grey_differences": _variant(
-        "Network by AD, renderer by finite differences", _differences, lambda n: 2 * n
-    ),
-    "grey_fr22": _variant(
-        "Network by AD, renderer by FR22",
-        _smoothed(sampler=sd.Gaussian(antithetic=True), **PAIR),
-        lambda n: 2,
-    ),
-    "grey_our_gradient": _variant(
-        "Network by AD, renderer by OurG",
-        _smoothed(sampler=sd.Importance(1), **PAIR),
-        lambda n: 2 * n,
-    ),
-    "grey_aggregate": _variant(
-        "Network by AD, renderer by OurG aggregate",
-        _smoothed(sampler=sd.Aggregate(1, share=0.0), **PAIR),
-        lambda n: 2,
-    ),
-    "grey_ours": _variant(
-        "Network by AD, renderer by smooth_grad (ours)", _smoothed(num_samples=4), lambda n: 4
-    ),
+FR22 = _smoothed(num_samples=2, baseline="none", sampler=sd.Gaussian(antithetic=True))
+OUR_GRADIENT = _smoothed(num_samples=2, baseline="none", sampler=sd.Importance(1))
+AGGREGATE = _smoothed(num_samples=2, baseline="none", sampler=sd.Aggregate(1, share=0.0))
+METHODS = {
+    "grey_differences": _entry("finite differences", _differences, lambda n: 2 * n),
+    "grey_fr22": _entry("FR22", FR22, lambda n: 2),
+    "grey_our_gradient": _entry("OurG", OUR_GRADIENT, lambda n: 2 * n),
+    "grey_aggregate": _entry("OurG aggregate", AGGREGATE, lambda n: 2),
+    "grey_ours": _entry("smooth_grad (ours)", _smoothed(num_samples=4), lambda n: 4),
 }

@@ -19,6 +19,7 @@ Wang, Distributed optimization of deeply nested systems, 2014).
 """
 
 import itertools
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -29,9 +30,8 @@ import numpy as np
 import optax
 
 import smoothdiff as sd
-from benchmarks._task import NotAble, Solve, Task
+from benchmarks._task import Grey, Key, MethodEntry, NotAble, Problem, Solve, Y
 
-TITLE = "Network by AD, renderer by Gauss-Newton (ours)"
 CASES = 32  # whose solvers take a step at a time
 LESSONS = 16, 240  # steps of Adam after the first time, and after the last one
 BATCH = 16, 48  # cases in a lesson, and renders
@@ -62,65 +62,50 @@ class Rendered(NamedTuple):
         return jax.tree.map(lambda a, b: jnp.concatenate([a, b])[len(b) :], self, new)
 
 
-def prepare(task: Task) -> Solve:
-    """Compiles steps of the solvers and lessons of the network."""
-    grey = task.grey
-    if grey is None:
-        raise NotAble("this task has no part that AD knows")
-    render, pictures = grey.render, grey.cases
-    count = len(pictures)
-    answer = jnp.zeros_like(jax.eval_shape(grey.white, task.reference, pictures[0]))
-    samples = sd.GaussNewton(grey.sigma).evaluations_per_step(answer)
-    solver = sd.GaussNewton(grey.sigma, num_samples=samples, history=2 * samples)
-    function = lambda x, picture: (render(x) - picture, None)
-    drawn = min(CASES, count)
-    # renders of the solver: its samples, where it was, the network's answer; and as many new poses
-    each = samples + 2
-    rounds = max(1, task.budget.evaluations // (drawn * 2 * each))
-    lessons = np.linspace(*LESSONS, rounds).astype(int)
-    optim = optax.adam(optax.linear_schedule(RATE, DECAY * RATE, int(lessons.sum())))
-    answers = jax.jit(lambda y: jax.vmap(partial(grey.white, y))(pictures))
+class Solvers:
+    """A solver for each case, and what all cases learn from their renders.
 
-    def step(key, said, others, best, loss, at, state, picture):
-        """One step of one solver, and what was rendered for it, and of other poses."""
-        tried = jnp.concatenate([jnp.stack([at, said]), others])
-        shown = jax.vmap(render)(tried)
-        losses = jnp.append(_finite(jnp.mean((shown - picture[None]) ** 2, (1, 2, 3))), loss)
-        start = jnp.append(tried, best[None], axis=0)[jnp.argmin(losses)]
-        jump = jnp.sqrt(jnp.mean((start - at) ** 2)) / grey.sigma
-        scale = state.search.scale
-        scale = jnp.clip(jump, scale, jnp.maximum(scale, 1))
-        state = eqx.tree_at(lambda state: state.search.scale, state, scale)
-        at, state, _ = solver.step(function, start, picture, {"key": key}, state, frozenset())
-        points, residuals, valid = (
-            leaf[-samples:]
-            for leaf in (
-                state.search.history.points,
-                state.search.history.residuals,
-                state.search.history.valid,
-            )
-        )
-        seen: jax.Array = residuals.reshape(samples, *picture.shape) + picture[None]
-        seen = jnp.where(valid[:, None, None, None], seen, jnp.nan)
-        return at, state, Rendered(jnp.append(tried, points, 0), jnp.append(shown, seen, 0))
+    Args:
+        grey: The loss in two parts.
+        answer: What the network says of a picture, for its shape.
+    """
 
-    @jax.jit
-    def solve_some(key, y, known: Known, rendered: Rendered, chosen):
-        """Steps of the solvers of some cases, from whose renders all cases learn."""
-        draw, *keys = jax.random.split(key, drawn + 1)
-        said = jax.vmap(partial(grey.white, y))(pictures[chosen])
+    def __init__(self, grey: Grey, answer: jax.Array):
+        samples = sd.GaussNewton(grey.sigma).evaluations_per_step(answer)
+        self._grey, self._samples = grey, samples
+        self._solver = sd.GaussNewton(grey.sigma, num_samples=samples, history=2 * samples)
+        self._function = lambda x, picture: (grey.render(x) - picture, None)
+        self._picture = jax.eval_shape(grey.render, answer)
+        self.drawn = min(CASES, len(grey.cases))
+        # renders of a solver: its samples, where it was, the network's answer
+        self._each = samples + 2
+        # and as many new poses
+        self.evaluations = self.drawn * 2 * self._each
+
+    def begin(self, key: Key, said: jax.Array) -> tuple[Known, Rendered]:
+        """What is known when the network has said this of the cases, and no render yet."""
+        rest = {"key": key}, self._picture, None, frozenset()
+        begin = lambda x: self._solver.init(self._function, x, None, *rest)
+        known = Known(said, jnp.full(len(said), jnp.inf), said, jax.vmap(begin)(said))
+        nothing = (jnp.full((KEPT, *a.shape), jnp.nan, a.dtype) for a in (said[0], self._picture))
+        return known, Rendered(*nothing)
+
+    def step(
+        self, key: Key, y: Y, known: Known, rendered: Rendered, chosen: jax.Array
+    ) -> tuple[Known, Rendered, jax.Array]:
+        """Steps of the solvers of some cases; also which renders are within the known range."""
+        pictures = self._grey.cases
+        draw, *keys = jax.random.split(key, self.drawn + 1)
+        said = jax.vmap(partial(self._grey.white, y))(pictures[chosen])
         # at first nothing is known, and these are all but what the untrained network says
-        others = _like(draw, known.best, (drawn, each))
+        others = _like(draw, known.best, (self.drawn, self._each))
         best, loss, at, states = jax.tree.map(lambda leaf: leaf[chosen], known)
-        at, states, made = jax.vmap(step)(
+        at, states, made = jax.vmap(self._step)(
             jnp.stack(keys), said, others, best, loss, at, states, pictures[chosen]
         )
         points: jax.Array
         points, shown = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), made)
-        # nearest by products of matrices, and then as exactly as before
-        flat, wanted = shown.reshape(len(shown), -1), pictures.reshape(count, -1)
-        nearest = jnp.argmin(_finite(jnp.sum(flat**2, 1)[None] - 2 * wanted @ flat.T), axis=1)
-        loss = _finite(jnp.mean((flat[nearest] - wanted) ** 2, axis=1))
+        nearest, loss = _nearest(shown, pictures)
         better = loss < known.loss
         known = Known(
             jnp.where(better[:, None], points[nearest], known.best),
@@ -129,45 +114,56 @@ def prepare(task: Task) -> Solve:
             jax.tree.map(lambda leaf, part: leaf.at[chosen].set(part), known.states, states),
         )
         rendered = rendered.after(points, shown)
-        low, high = jnp.min(known.best, axis=0), jnp.max(known.best, axis=0)
-        within = (rendered.points >= low[None]) & (rendered.points <= high[None])
-        within = within.all(axis=1) & jnp.isfinite(rendered.shown).all(axis=(1, 2, 3))
-        return known, rendered, within
+        return known, rendered, _within(rendered, known.best)
+
+    def _step(self, key, said, others, best, loss, at, state, picture):
+        """One step of one solver, and what was rendered for it, and of other poses."""
+        tried = jnp.concatenate([jnp.stack([at, said]), others])
+        shown = jax.vmap(self._grey.render)(tried)
+        losses = jnp.append(_finite(jnp.mean((shown - picture[None]) ** 2, (1, 2, 3))), loss)
+        start = jnp.append(tried, best[None], axis=0)[jnp.argmin(losses)]
+        # after a jump the solver looks as far around as it has jumped, up to its first width
+        jump = jnp.sqrt(jnp.mean((start - at) ** 2)) / self._grey.sigma
+        scale = state.search.scale
+        scale = jnp.clip(jump, scale, jnp.maximum(scale, 1))
+        state = eqx.tree_at(lambda state: state.search.scale, state, scale)
+        rest = picture, {"key": key}, state, frozenset()
+        at, state, _ = self._solver.step(self._function, start, *rest)
+        history = state.search.history
+        last = slice(-self._samples, None)
+        seen: jax.Array = history.residuals[last].reshape(-1, *picture.shape) + picture[None]
+        seen = jnp.where(history.valid[last, None, None, None], seen, jnp.nan)
+        points = jnp.append(tried, history.points[last], 0)
+        return at, state, Rendered(points, jnp.append(shown, seen, 0))
+
+
+def prepare(problem: Problem) -> Solve:
+    """Compiles steps of the solvers and lessons of the network."""
+    grey = problem.grey
+    if grey is None:
+        raise NotAble("this task has no part that AD knows")
+    count = len(grey.cases)
+    answer = jnp.zeros_like(jax.eval_shape(grey.white, problem.like, grey.cases[0]))
+    solvers = Solvers(grey, answer)
+    rounds = max(1, problem.budget.evaluations // solvers.evaluations)
+    lessons = np.linspace(*LESSONS, rounds).astype(int)
+    optim = optax.adam(optax.linear_schedule(RATE, DECAY * RATE, int(lessons.sum())))
+    answers = jax.jit(lambda y: jax.vmap(partial(grey.white, y))(grey.cases))
+    step = jax.jit(solvers.step)
 
     @jax.jit
-    def learn(key, y, state, best, rendered: Rendered, within):
-        """One lesson on cases and renders that have been drawn, the latter from those within."""
-        of_cases, of_renders = jax.random.split(key)
-        cases, renders = BATCH
-        case = jax.random.choice(of_cases, count, (cases,))
-        share = within.astype(best.dtype)
-        # where there are no renders to learn from, what is drawn has no weight
-        number = jax.random.choice(of_renders, KEPT, (renders,), p=share / jnp.sum(share))
-        weight = jnp.append(jnp.ones(cases), within[number])
-        shown = jnp.where(within[number][:, None, None, None], rendered.shown[number], 0)
-        inputs = jnp.append(pictures[case], shown, axis=0)
-        targets = jnp.append(best[case], rendered.points[number], axis=0)
-        targets = jnp.where(weight[:, None] > 0, targets, 0)
-
-        def misfit(y):
-            said = jax.vmap(partial(grey.white, y))(inputs)
-            each = optax.huber_loss(said, targets, delta=DOUBT * grey.sigma)
-            return jnp.mean(weight[:, None] * each)
-
+    def learn(key, y, state, best, rendered, within):
+        misfit = _lesson(key, grey, best, rendered, within)
         updates, state = optim.update(jax.grad(misfit)(y), state, y)
         return optax.apply_updates(y, updates), state
 
     def solve(y0, key, record):
         y, mean, state, taught = y0, y0, optim.init(y0), 0
-        said, shape = answers(y), jax.eval_shape(render, answer)
-        begin = lambda x: solver.init(function, x, None, {"key": key}, shape, None, frozenset())
-        known = Known(said, jnp.full(count, jnp.inf), said, jax.vmap(begin)(said))
-        nothing = (jnp.full((KEPT, *a.shape), jnp.nan, a.dtype) for a in (answer, shape))
-        rendered = Rendered(*nothing)
+        known, rendered = solvers.begin(key, answers(y))
         for i in itertools.count():
             solving, learning = jax.random.split(jax.random.fold_in(key, i))
-            chosen = jnp.arange(i * drawn, (i + 1) * drawn) % count
-            known, rendered, within = solve_some(solving, mean, known, rendered, chosen)
+            chosen = jnp.arange(i * solvers.drawn, (i + 1) * solvers.drawn) % count
+            known, rendered, within = step(solving, mean, known, rendered, chosen)
             for lesson in jax.random.split(learning, lessons[min(i, rounds - 1)]):
                 y, state = learn(lesson, y, state, known.best, rendered, within)
                 mean = optax.incremental_update(y, mean, LATE / (LATE + taught))
@@ -175,6 +171,45 @@ def prepare(task: Task) -> Solve:
             record(mean)
 
     return solve
+
+
+def _lesson(
+    key: Key, grey: Grey, best: jax.Array, rendered: Rendered, within: jax.Array
+) -> Callable[[Y], jax.Array]:
+    """The misfit of a network on cases and renders that are drawn, the latter from those within."""
+    of_cases, of_renders = jax.random.split(key)
+    cases, renders = BATCH
+    case = jax.random.choice(of_cases, len(grey.cases), (cases,))
+    share = within.astype(best.dtype)
+    # where there are no renders to learn from, what is drawn has no weight
+    number = jax.random.choice(of_renders, KEPT, (renders,), p=share / jnp.sum(share))
+    weight = jnp.append(jnp.ones(cases), within[number])
+    shown = jnp.where(within[number][:, None, None, None], rendered.shown[number], 0)
+    inputs = jnp.append(grey.cases[case], shown, axis=0)
+    targets = jnp.append(best[case], rendered.points[number], axis=0)
+    targets = jnp.where(weight[:, None] > 0, targets, 0)
+
+    def misfit(y):
+        said = jax.vmap(partial(grey.white, y))(inputs)
+        each = optax.huber_loss(said, targets, delta=DOUBT * grey.sigma)
+        return jnp.mean(weight[:, None] * each)
+
+    return misfit
+
+
+def _nearest(shown: jax.Array, pictures: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """For each picture the number of the render that is nearest, and its loss."""
+    flat, wanted = shown.reshape(len(shown), -1), pictures.reshape(len(pictures), -1)
+    # nearest by products of matrices, and then exactly
+    nearest = jnp.argmin(_finite(jnp.sum(flat**2, 1)[None] - 2 * wanted @ flat.T), axis=1)
+    return nearest, _finite(jnp.mean((flat[nearest] - wanted) ** 2, axis=1))
+
+
+def _within(rendered: Rendered, best: jax.Array) -> jax.Array:
+    """Which renders did not fail, and are of poses within the range of the best ones."""
+    low, high = jnp.min(best, axis=0), jnp.max(best, axis=0)
+    inside = (rendered.points >= low[None]) & (rendered.points <= high[None])
+    return inside.all(axis=1) & jnp.isfinite(rendered.shown).all(axis=(1, 2, 3))
 
 
 def _like(key: jax.Array, best: jax.Array, shape: tuple[int, int]) -> jax.Array:
@@ -193,3 +228,10 @@ def _like(key: jax.Array, best: jax.Array, shape: tuple[int, int]) -> jax.Array:
 def _finite(losses: jax.Array) -> jax.Array:
     """What is not finite is the worst."""
     return jnp.where(jnp.isfinite(losses), losses, jnp.inf)
+
+
+METHODS = {
+    "grey_gauss_newton": MethodEntry(
+        "Network by AD, renderer by Gauss-Newton (ours)", ("network",), prepare
+    )
+}

@@ -1,14 +1,19 @@
 """The renderer's own automatic differentiation, with Adam: what one uses where it works."""
 
-from benchmarks._task import NotAble, Solve, Task
+from jax.flatten_util import ravel_pytree
+
+from benchmarks._task import MethodEntry, NotAble, Problem, Solve
 from benchmarks.methods._adam import adam
+from benchmarks.methods._flat import Flat
 
-TITLE = "Mitsuba AD, Adam"
 
-
-def prepare(task: Task) -> Solve:
-    """Takes the gradient that the task's renderer gives, if it gives one."""
-    if task.native_ad is None:
+def prepare(problem: Problem) -> Solve:
+    """Takes the gradient that the problem's renderer gives, if it gives one."""
+    if problem.native_ad is None:
         raise NotAble("this task has no derivative of its own")
-    value_and_grad = task.native_ad()
-    return adam(task, lambda y: value_and_grad(y)[1], evaluations_per_step=2)
+    flat, value_and_grad = Flat(problem), problem.native_ad()
+    gradient = lambda key, i, x: ravel_pytree(value_and_grad(flat.tree(x))[1])[0]
+    return adam(flat, gradient, evaluations_per_step=2)
+
+
+METHODS = {"mitsuba_ad": MethodEntry("Mitsuba AD, Adam", ("scene",), prepare)}

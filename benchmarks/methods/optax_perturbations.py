@@ -4,7 +4,6 @@ As with the smoothed gradient of FR22, sigma falls linearly over the budget. A s
 and the value at the point itself, which optax subtracts from theirs.
 """
 
-import itertools
 from typing import Any
 
 import jax
@@ -12,37 +11,31 @@ import jax.numpy as jnp
 import optax
 from optax import perturbations
 
-from benchmarks._task import Solve, Task
-from benchmarks.methods._adam import optimiser
+from benchmarks._task import MethodEntry, Problem, Solve
+from benchmarks.methods._adam import adam
 from benchmarks.methods._flat import Flat
 
-TITLE = "optax.perturbations, Adam"
 NUM_SAMPLES = 3
-SIGMA_END = 0.1  # of the task's sigma
+SIGMA_END = 0.1  # of the problem's sigma
 
 
-def prepare(task: Task) -> Solve:
-    """Compiles one step for all starts."""
-    flat = Flat(task)
-    per_step = NUM_SAMPLES + 1
-    optim = optimiser(task, per_step)
+def prepare(problem: Problem) -> Solve:
+    """Compiles the gradient once for all starts."""
+    flat = Flat(problem)
+    evaluations = NUM_SAMPLES + 1
+    steps = problem.budget.evaluations // evaluations
+    sigma_at = optax.linear_schedule(problem.sigma, SIGMA_END * problem.sigma, steps)
     smooth: Any = perturbations.make_perturbed_fun  # it takes more than its annotations say
-    sigma_at = optax.linear_schedule(
-        task.sigma, SIGMA_END * task.sigma, task.budget.evaluations // per_step
-    )
 
     @jax.jit
-    def step(key, x, state, i):
+    def gradient(key, i, x):
         sigma = jnp.asarray(sigma_at(i), flat.dtype)
         smoothed = smooth(flat.loss, NUM_SAMPLES, sigma, perturbations.Normal())
-        updates, state = optim.update(jax.grad(smoothed, argnums=1)(key, x), state, x)
-        return flat.clip(x + jnp.asarray(updates)), state
+        return jax.grad(smoothed, argnums=1)(key, x)
 
-    def solve(y0, key, record):
-        x = jnp.asarray(flat.start(y0), flat.dtype)
-        state = optim.init(x)
-        for i in itertools.count():
-            x, state = step(jax.random.fold_in(key, i), x, state, i)
-            record(flat.tree(x))
+    return adam(flat, gradient, evaluations)
 
-    return solve
+
+METHODS = {
+    "optax_perturbations": MethodEntry("optax.perturbations, Adam", ("scene",), prepare),
+}

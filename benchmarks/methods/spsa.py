@@ -13,20 +13,19 @@ import itertools
 import jax
 import jax.numpy as jnp
 
-from benchmarks._task import Solve, Task
+from benchmarks._task import MethodEntry, Problem, Solve
 from benchmarks.methods._flat import Flat
 
-TITLE = "SPSA"
 STEP_DECAY, WIDTH_DECAY = 0.602, 0.101  # Spall's alpha and gamma
 STABILITY = 0.1  # of all steps: so many come before the first, as it were
 FIRST_STEP = 0.1  # in units of sigma
 PILOTS = 5
 
 
-def prepare(task: Task) -> Solve:
+def prepare(problem: Problem) -> Solve:
     """Compiles the two evaluations of a step, and the step."""
-    flat = Flat(task)
-    before = STABILITY * task.budget.evaluations / 2 + 1
+    flat, sigma = Flat(problem), problem.sigma
+    before = STABILITY * problem.budget.evaluations / 2 + 1
 
     @jax.jit
     def slope(key, x, width):
@@ -37,7 +36,7 @@ def prepare(task: Task) -> Solve:
 
     @jax.jit
     def step(key, x, i, gain):
-        along, diagonal = slope(key, x, task.sigma / (i + 1) ** WIDTH_DECAY)
+        along, diagonal = slope(key, x, sigma / (i + 1) ** WIDTH_DECAY)
         return flat.clip(x - gain / (i + before) ** STEP_DECAY * along * diagonal)
 
     def solve(y0, key, record):
@@ -45,11 +44,14 @@ def prepare(task: Task) -> Solve:
         keys = (jax.random.fold_in(key, i) for i in itertools.count())
         size = 0.0
         while size == 0:  # on a plateau a slope says nothing
-            size = sum(abs(float(slope(next(keys), x, task.sigma)[0])) for _ in range(PILOTS))
+            size = sum(abs(float(slope(next(keys), x, sigma)[0])) for _ in range(PILOTS))
             record(flat.tree(x))
-        gain = jnp.asarray(FIRST_STEP * task.sigma * before**STEP_DECAY * PILOTS / size, flat.dtype)
+        gain = jnp.asarray(FIRST_STEP * sigma * before**STEP_DECAY * PILOTS / size, flat.dtype)
         for i in itertools.count():
             x = step(next(keys), x, jnp.asarray(i, flat.dtype), gain)
             record(flat.tree(x))
 
     return solve
+
+
+METHODS = {"spsa": MethodEntry("SPSA", ("scene", "large", "program"), prepare)}

@@ -3,22 +3,24 @@
 import optax
 
 import smoothdiff as sd
-from benchmarks._task import Solve, Task
+from benchmarks._task import MethodEntry, Problem, Solve
 from benchmarks.methods._host_loop import run_by
 
-TITLE = "ZeroGrads (ours)"
 NUM_SAMPLES = 2
 RATE, RATE_END = 0.05, 0.001  # in units of sigma, linear in between
 
 
-def rate(task: Task, num_samples: int = NUM_SAMPLES) -> optax.Schedule:
+def rate(problem: Problem, num_samples: int = NUM_SAMPLES) -> optax.Schedule:
     """The rate of the parameters, in their units."""
-    steps = task.budget.evaluations // num_samples
-    return optax.linear_schedule(RATE * task.sigma, RATE_END * task.sigma, steps)
+    steps = problem.budget.evaluations // num_samples
+    return optax.linear_schedule(RATE * problem.sigma, RATE_END * problem.sigma, steps)
 
 
-def prepare(task: Task) -> Solve:
+def prepare(problem: Problem) -> Solve:
     """One solver and one function for all starts, so that they are compiled once."""
-    optim = optax.adam(rate(task))
-    solver = sd.ZeroGrads(task.sigma, num_samples=NUM_SAMPLES, optimizer=optim)
-    return run_by(sd.minimise, task, task.loss, solver)
+    optim = optax.adam(rate(problem))
+    solver = sd.ZeroGrads(problem.sigma, num_samples=NUM_SAMPLES, optimizer=optim)
+    return run_by(sd.minimise, problem, problem.loss, solver)
+
+
+METHODS = {"zerograds": MethodEntry("ZeroGrads (ours)", ("scene", "large", "program"), prepare)}

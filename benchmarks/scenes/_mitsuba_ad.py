@@ -5,7 +5,6 @@ colours. How these follow from y are exact little formulas, which are difference
 """
 
 import zlib
-from collections.abc import Callable, Mapping
 from typing import Any
 
 import drjit as dr
@@ -15,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from benchmarks._task import NativeAD, NotAble
-from benchmarks.scenes._mitsuba_task import UP
+from benchmarks.scenes.mitsuba_scene import UP, Describe, Description, Params
 from smoothdiff.renderers import mitsuba
 from smoothdiff.renderers._mitsuba_scene import Scene, mitsuba_with, scene_values
 
@@ -24,16 +23,16 @@ STEP = 1e-2  # of the differences
 
 
 def value_and_grad(
-    scene: Callable[[Any], dict[str, Any]],
-    params: Mapping[str, Callable[[Array], Array]],
-    integrator: dict[str, Any],
+    scene: Describe,
+    params: Params,
+    integrator: Description,
     photo: Float[np.ndarray, "height width 3"],
     spp: int,
 ) -> NativeAD:
     """`y -> (loss, gradient)`, not to be traced by JAX; each y has other noise.
 
     Args:
-        scene: As for `scene_task`.
+        scene: As for `picture`.
         params: Likewise.
         integrator: One that knows of edges that move, such as `direct_projective`.
         photo: The picture to be matched.
@@ -51,7 +50,7 @@ def value_and_grad(
         # the border is for edges that enter the picture
         film = {"width": width, "height": height, "sample_border": True}
         description["camera"]["film"] |= film
-        del description["camera"]["sampler"]  # the integrator needs one of its own
+        description["camera"].pop("sampler", None)  # the integrator needs one of its own
         loaded = Scene.of(description)
         parameters = mi.traverse(loaded.scene)
     axes = {key.removesuffix(".rotate"): UP for key in params if key.endswith(".rotate")}

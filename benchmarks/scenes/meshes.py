@@ -32,6 +32,15 @@ def icosphere(level: int) -> tuple[Positions, Faces]:
     return positions / np.linalg.norm(positions, axis=1, keepdims=True), faces
 
 
+def ball(vertices: int) -> tuple[Positions, Faces]:
+    """A unit sphere of any number of vertices, on a spiral."""
+    k = np.arange(vertices) + 0.5
+    z, angle = 1 - 2 * k / vertices, np.pi * (1 + 5**0.5) * k
+    radius = np.sqrt(1 - z**2)
+    positions = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+    return positions, _outwards(positions, ConvexHull(positions).simplices)
+
+
 def cube(cells: int) -> tuple[Positions, Faces]:
     """A cube from -SIDE to SIDE, each of its faces cut into cells² squares of two triangles."""
     i, j = np.meshgrid(np.arange(cells), np.arange(cells), indexing="ij")

@@ -1,48 +1,57 @@
-"""Tasks whose parameters are shares of their ranges, and whose loss compares what is drawn."""
+"""What tasks share whose loss compares what parameters draw with what the reference draws."""
 
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int, Shaped
+from numpy.typing import ArrayLike
 
-from benchmarks._task import Task
+from benchmarks._task import Budget, Problem, Score, Task
+
+
+def uniform(
+    n: int, low: float = 0.0, high: float = 1.0, around: ArrayLike = 0.0
+) -> Callable[[int], Float[Array, " n"]]:
+    """Starts, seed -> y, anywhere between low and high, or so far from where they are around."""
+    away = lambda seed: jax.random.uniform(jax.random.key(seed), (n,), minval=low, maxval=high)
+    return lambda seed: jnp.asarray(around) + away(seed)
 
 
 def drawn(
     name: str,
     title: str,
     draw: Callable[[Float[Array, " n"]], Float[Array, "..."]],
-    reference: np.ndarray,
+    reference: ArrayLike,
+    *,
+    sigma: float,
+    budget: Budget,
+    seeds: int,
+    start: Callable[[int], Float[Array, " n"]] | None = None,
+    bounds: tuple[float, float] = (0.0, 1.0),
     support: Any = None,
+    image: Callable[[Float[Array, " n"]], Float[Array, "height width 3"]] | None = None,
     meaning: Callable[[Float[Array, " n"]], Shaped[Array, "..."]] | None = None,
-    **others: Any,
+    optimum: float | None = None,
+    notes: str = "",
 ) -> Task:
-    """The task of finding what draws the same as the reference does.
-
-    The domain is [0, 1] for each parameter, and a start is anywhere in it. The loss is the mean
-    squared difference.
+    """The task of finding what draws the same as the reference does; others as in `Task`.
 
     Args:
-        name: As in `Task`.
-        title: As in `Task`.
-        draw: From parameters to an array: a picture, or places at some times.
-        reference: The parameters that are sought, each in [0, 1].
+        draw: From parameters to an array: a picture, or places at some times. The loss is the mean
+            squared difference.
+        start: By default anywhere in the domain.
+        bounds: Those of each parameter. By default parameters are shares of their ranges.
         support: Which parts of what is drawn a parameter may influence, or None.
         meaning: What parameters mean to a program of switches and counts, or None. The parameter
             error is then the number of entries that differ from the reference's.
-        others: Further fields of the task.
     """
     sought = jnp.asarray(reference, jnp.float32)
     target = jax.jit(draw)(sought)
 
     def residuals(y: Float[Array, " n"]) -> Float[Array, "..."]:
         return draw(y) - target
-
-    def loss(y: Float[Array, " n"]) -> Float[Array, ""]:
-        return jnp.mean(residuals(y) ** 2)
 
     def terms(y: Float[Array, " n"]) -> Float[Array, "..."]:
         return residuals(y) ** 2 / target.size
@@ -51,17 +60,20 @@ def drawn(
         assert meaning is not None
         return jnp.sum(meaning(y) != meaning(sought))
 
+    low, high = (jnp.full_like(sought, bound) for bound in bounds)
     return Task(
-        name=name,
-        title=title,
-        loss=loss,
-        exact_loss=loss,
-        start=lambda seed: jax.random.uniform(jax.random.key(seed), sought.shape),
-        reference=sought,
-        bounds=(jnp.zeros_like(sought), jnp.ones_like(sought)),
-        residuals=residuals,
-        terms=None if support is None else terms,
-        support=support,
-        distance=None if meaning is None else wrong,
-        **others,
+        name,
+        title,
+        Problem(
+            (low, high),
+            sigma,
+            budget,
+            residuals=residuals,
+            terms=None if support is None else terms,
+            support=support,
+        ),
+        Score(sought, image=image, distance=None if meaning is None else wrong, optimum=optimum),
+        start or uniform(sought.size),
+        seeds,
+        notes=notes,
     )

@@ -4,14 +4,13 @@ Appendix G of the paper on higher-order rendering. Everything is smooth in the p
 there is a Hessian to compare with.
 """
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from benchmarks._task import Budget, Task
+from benchmarks._task import Budget, Task, TaskEntry
+from benchmarks.tasks._drawn import drawn, uniform
 
-TITLE = "BRDF: Phong's model of a sphere under a point light"
 LIGHT = np.array([1.5, 1.5, 3.0])  # of a sphere of radius 1 at the origin; the eye is far along z
 # diffuse and specular colour, and gloss: 0 to 1 for exponents 1 to 256
 REFERENCE = (0.7, 0.3, 0.2, 0.4, 0.5, 0.6, 0.6)
@@ -45,30 +44,19 @@ def _geometry(pixels: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def build(full: bool) -> Task:
     """Quick: 32 x 32 pixels; full: 64 x 64. Parameters are between 0 and 1."""
     pixels = 64 if full else 32
-    reference = jnp.asarray(REFERENCE)
-    target = shade(reference, pixels)
-
-    def residuals(y: Float[Array, "7"]) -> Float[Array, "pixels pixels 3"]:
-        return shade(y, pixels) - target
-
-    def loss(y: Float[Array, "7"]) -> Float[Array, ""]:
-        return jnp.mean(residuals(y) ** 2)
-
-    def start(seed):
-        return jax.random.uniform(jax.random.key(seed), (7,), minval=SPARED, maxval=1 - SPARED)
-
-    return Task(
-        name="brdf",
-        title=TITLE,
-        loss=loss,
-        exact_loss=loss,
-        start=start,
-        reference=reference,
-        bounds=(jnp.zeros(7), jnp.ones(7)),
+    draw = lambda y: shade(y, pixels)
+    return drawn(
+        "brdf",
+        TASKS["brdf"].title,
+        draw,
+        REFERENCE,
         sigma=0.15,
         budget=Budget(5000, 60) if full else Budget(2000, 15),
         seeds=20 if full else 3,
-        image=lambda y: shade(y, pixels),
-        residuals=residuals,
+        start=uniform(7, SPARED, 1 - SPARED),
+        image=draw,
         notes=f"{pixels} x {pixels} pixels",
     )
+
+
+TASKS = {"brdf": TaskEntry("BRDF: Phong's model of a sphere under a point light", "scene", build)}

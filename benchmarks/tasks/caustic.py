@@ -19,13 +19,9 @@ from jaxtyping import Array, Float
 from scipy import interpolate
 
 import smoothdiff as sd
-from benchmarks._task import Budget, Task
+from benchmarks._task import Budget, Problem, Score, Task, TaskEntry
 
 TITLE = "Caustic: 1,024 coefficients of a refracting height field"
-METHODS = (
-    *("spsa", "fr22", "cma_es_diagonal", "zerograds", "first_order", "local_first_order"),
-    *("gauss_newton", "local_gauss_newton"),
-)
 SIDE = 32  # coefficients
 INDEX = 1.33  # of refraction
 DISTANCE = 1.0  # of the receiver, in widths of the slab
@@ -47,30 +43,29 @@ def build(full: bool) -> Task:
         tiles = (draw(y, rays, pixels) - target).reshape(SIDE, side, SIDE, side)
         return jnp.swapaxes(tiles, 1, 2).reshape(SIDE, SIDE, -1)
 
-    def loss(y: Float[Array, "32 32"]) -> Float[Array, ""]:
-        return jnp.mean(residuals(y) ** 2)
-
     def terms(y: Float[Array, "32 32"]) -> Float[Array, "32 32"]:
         return jnp.sum(residuals(y) ** 2, axis=-1) / target.size
 
     def start(seed: int) -> Float[Array, "32 32"]:
         return 0.05 * jax.random.normal(jax.random.key(seed), (SIDE, SIDE))
 
+    def image(y: Float[Array, "32 32"]) -> Float[Array, "height width 3"]:
+        return jnp.repeat(draw(y, rays, pixels)[..., None] / 4, 3, axis=-1)
+
     return Task(
         name="caustic",
         title=TITLE,
-        loss=loss,
-        exact_loss=loss,
+        problem=Problem(
+            bounds=(jnp.full_like(reference, -BOUND), jnp.full_like(reference, BOUND)),
+            sigma=SIGMA,
+            budget=Budget(100_000, 600) if full else Budget(20_000, 120),
+            residuals=residuals,
+            terms=terms,
+            support=sd.moving_support(around),
+        ),
+        score=Score(reference, image=image),
         start=start,
-        reference=reference,
-        bounds=(jnp.full_like(reference, -BOUND), jnp.full_like(reference, BOUND)),
-        sigma=SIGMA,
-        budget=Budget(100_000, 600) if full else Budget(20_000, 120),
         seeds=10 if full else 2,
-        image=lambda y: jnp.repeat(draw(y, rays, pixels)[..., None] / 4, 3, axis=-1),
-        residuals=residuals,
-        terms=terms,
-        support=sd.moving_support(around),
         notes=f"{rays} x {rays} rays, {pixels} x {pixels} pixels. A wave that is even over the "
         "slab does not move light: the parameter error says little.",
     )
@@ -144,3 +139,6 @@ def _basis(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     knots = step * (np.arange(SIDE + 4) - 3)
     spline = interpolate.BSpline(knots, np.eye(SIDE), 3)
     return spline(places), spline.derivative()(places)
+
+
+TASKS = {"caustic": TaskEntry(TITLE, "large", build)}

@@ -13,12 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from benchmarks import methods
-from benchmarks._task import Budget, Task
+from benchmarks._task import Budget, Task, TaskEntry
 from benchmarks.tasks._drawn import drawn
 
-TITLE = "Gravity: three cubes that are dropped"
-METHODS = methods.PROGRAMS
 STEPS, SECONDS_PER_STEP, SEEN_EVERY = 900, 1 / 500, 225
 GRAVITY, FRICTION, SLIP = 9.81, 0.6, 0.05
 HALF, INERTIA = 0.5, 1 / 6  # of cubes of mass 1
@@ -29,7 +26,6 @@ LOWEST = np.array([-0.8, 1.9, -0.8, 3.5, 0.2])
 HIGHEST = np.array([0.8, 2.4, 0.8, 4.2, 0.7])
 REFERENCE = (0.55, 0.4, 0.44, 0.6, 0.4)
 BOTTOM = (0.0, 0.8)
-SIGMA = 0.2
 
 
 def fall(y: Float[Array, "5"], rate: float) -> Float[Array, "times 2 4 2"]:
@@ -120,13 +116,16 @@ def build(full: bool) -> list[Task]:
     return [
         drawn(
             f"{kind}-5d",
-            f"{TITLE}, {kind} contacts",
+            f"{TASKS['gravity'].title}, {kind} contacts",
             partial(fall, rate=rate),
-            np.asarray(REFERENCE),
-            sigma=SIGMA,
+            REFERENCE,
+            sigma=0.2,
             budget=Budget(3000, 600) if full else Budget(600, 120),
             seeds=10 if full else 2,
             optimum=0.0,
         )
         for kind, rate in RATES.items()
     ]
+
+
+TASKS = {"gravity": TaskEntry("Gravity: three cubes that are dropped", "program", build)}

@@ -8,19 +8,14 @@ the domain.
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
-from scipy import sparse
 
 import smoothdiff as sd
-from benchmarks import methods
-from benchmarks._task import Budget, Task
+from benchmarks._task import Budget, Task, TaskEntry
 from benchmarks.tasks._drawn import drawn
 
-TITLE = "LED: 336 binary switches of a display"
-METHODS = methods.PROGRAMS
 PANELS, DIGITS, SEGMENTS = (4, 3), 4, 7
 SIZE = PANELS[0] * PANELS[1] * DIGITS * SEGMENTS
 ON = 0.5
-SIGMA = 0.33
 # the segment of each pixel of a digit; the others are dark
 DIGIT = np.array(
     [[int(c) if c.isdigit() else -1 for c in row] for row in (
@@ -54,6 +49,8 @@ def draw(y: Float[Array, "336"]) -> Float[Array, "44 84"]:
 
 def support():
     """Which pixels a parameter may change: those of its segment."""
+    from scipy import sparse
+
     pixels = np.flatnonzero(SEGMENT.ravel() >= 0)
     entries = (np.ones(pixels.size), (pixels, SEGMENT.ravel()[pixels]))
     return sd.matrix_support(sparse.coo_array(entries, (SEGMENT.size, SIZE)), SEGMENT.shape)
@@ -63,11 +60,11 @@ def build(full: bool) -> Task:
     """Starts are anywhere in the domain, so half of the switches are wrong."""
     return drawn(
         "led",
-        TITLE,
+        TASKS["led"].title,
         draw,
         REFERENCE,
-        support(),
-        sigma=SIGMA,
+        support=support(),
+        sigma=0.33,
         budget=Budget(60_000, 600) if full else Budget(8000, 120),
         seeds=10 if full else 3,
         image=lambda y: jnp.stack([draw(y), 0.1 * draw(y), 0.1 * draw(y)], axis=-1),
@@ -75,3 +72,6 @@ def build(full: bool) -> Task:
         optimum=0.0,
         notes="Both errors are the wrong switches, relative to those of the start.",
     )
+
+
+TASKS = {"led": TaskEntry("LED: 336 binary switches of a display", "program", build)}

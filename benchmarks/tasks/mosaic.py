@@ -8,15 +8,11 @@ Sigma is that of ZeroGrads (supplement, Table 1), in units of the domain.
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy import sparse
 
 import smoothdiff as sd
-from benchmarks import methods
-from benchmarks._task import Budget, Task
+from benchmarks._task import Budget, Task, TaskEntry
 from benchmarks.tasks._drawn import drawn
 
-TITLE = "Mosaic: rotations of 320 cubes"
-METHODS = methods.PROGRAMS
 ROWS, COLUMNS = 16, 20
 SIZE = ROWS * COLUMNS
 PIXELS, RAYS = 5, 6  # to the next column of cubes, which are one unit apart; along each axis
@@ -24,7 +20,6 @@ HALF = 0.33  # of a side; the diagonal is shorter than 1, so cubes do not touch
 UP, AWAY = np.sin(np.radians(35)), np.cos(np.radians(35))  # of the camera's elevation
 SHADES = (0.35, 1.0, 0.7)  # of the left side, the right side and the top
 FLOOR = 0.15
-SIGMA = 0.025
 
 
 def _rays() -> tuple[np.ndarray, np.ndarray]:
@@ -78,6 +73,8 @@ def draw(y: Float[Array, "320"]) -> Float[Array, "48 100 3"]:
 
 def support():
     """Which values of the picture a parameter may change: those of pixels that may see its cube."""
+    from scipy import sparse
+
     height, _, width, _ = BY_PIXEL
     which, line = np.nonzero(THERE)
     row, column = ROW[which, line, None], np.arange(COLUMNS)[None]
@@ -91,13 +88,16 @@ def support():
 def build(full: bool) -> Task:
     return drawn(
         "mosaic",
-        TITLE,
+        TASKS["mosaic"].title,
         draw,
         REFERENCE,
-        support(),
-        sigma=SIGMA,
+        support=support(),
+        sigma=0.025,
         budget=Budget(60_000, 900) if full else Budget(8000, 240),
         seeds=10 if full else 2,
         image=draw,
         notes=f"{BY_PIXEL[2]} x {BY_PIXEL[0]} pixels of {RAYS} x {RAYS} rays",
     )
+
+
+TASKS = {"mosaic": TaskEntry("Mosaic: rotations of 320 cubes", "program", build)}

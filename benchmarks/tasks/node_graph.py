@@ -10,12 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from benchmarks import methods
-from benchmarks._task import Budget, Task
+from benchmarks._task import Budget, Task, TaskEntry
 from benchmarks.tasks._drawn import drawn
 
-TITLE = "Node graph: the edges of a procedural texture"
-METHODS = methods.PROGRAMS
 PIXELS = 32
 # input -> the nodes from which an edge to it can come; the patterns are nodes 0 to 2
 INPUTS = {
@@ -33,7 +30,6 @@ EDGES = [(where, source) for where, sources in INPUTS.items() for source in sour
 REFERENCE = np.array([0.75 if SOUGHT[where] == source else 0.25 for where, source in EDGES])
 NOTHING = 0.3  # what an input without an edge is given
 DARK, LIGHT = (0.1, 0.05, 0.2), (0.95, 0.8, 0.5)
-SIGMA = 0.2
 
 
 def _patterns() -> np.ndarray:
@@ -77,10 +73,10 @@ def build(full: bool) -> Task:
     """Starts are anywhere in the domain, so each edge is there or not by chance."""
     return drawn(
         "node-graph",
-        TITLE,
+        TASKS["node-graph"].title,
         draw,
         REFERENCE,
-        sigma=SIGMA,
+        sigma=0.2,
         budget=Budget(10_000, 240) if full else Budget(2000, 60),
         seeds=10 if full else 3,
         image=draw,
@@ -88,3 +84,6 @@ def build(full: bool) -> Task:
         optimum=0.0,
         notes=f"{PIXELS} x {PIXELS} pixels; an edge may have no effect",
     )
+
+
+TASKS = {"node-graph": TaskEntry("Node graph: the edges of a procedural texture", "program", build)}

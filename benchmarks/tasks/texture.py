@@ -5,57 +5,54 @@ The passes are tuned: the paper's 5 reach a quarter as far on its 512² texels a
 comparisons: of filters, of filters before and after the moments, and of one moment or both.
 """
 
-from collections.abc import Mapping, Sequence
 from functools import cache, partial
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
-from optax import GradientTransformation as Transformation
 
-import smoothdiff as sd
-from benchmarks.descents import (
+from benchmarks._descent import (
     EPS,
-    Build,
     Configuration,
     Descent,
     Filter,
-    Optimiser,
     Rate,
-    denoising,
-    keep_within,
-    postfiltered,
-    prefiltered,
+    filtered,
+    problem,
     variants,
 )
+from benchmarks._task import Score, Task, TaskEntry
 from benchmarks.scenes import plate
+from smoothdiff.filters import bilateral, cross_bilateral, laplacian
 
 TITLE = "Roughness of a plate, one sample a pixel"
 START = 0.4
 SAMPLES = 1024  # of the reference
 SCORED = 64  # samples of the picture by which a roughness is scored
-RATES = (0.003, 0.01, 0.03, 0.1)
 MARKS = (10, 25, 50, 100)
-DECAY = (0.2,)  # b1, the paper's best
 
 
-def build(full: bool) -> list[Descent]:
+def build(full: bool) -> list[Task]:
     size = 512 if full else 128
-    guided = {f"levels={levels}": cross(levels) for levels in (3, 4, 5)}
-    adam = Configuration("adam", "Adam", tried({"": None}, b1s=(0.2, 0.5, 0.9)))
+    tried = partial(variants, (0.2,))  # b1, the paper's best
+    smooth = {f"lam={lam}": laplacian(lam, ndim=2) for lam in (1, 3, 10)}
+    by_itself = {f"sigma_d={s}": bilateral(s, 3, ndim=2) for s in (0.3, 1.0, 3.0)}
+    guided = {f"levels={n}": cross_bilateral(0.1, n, ndim=2, log=True) for n in (3, 4, 5)}
+    halved = {f"levels={n}": cross_bilateral(0.1, n, ndim=2, log=True) for n in (2, 3)}
+    before = partial(filtered, where=("prefilter",))
+    around = partial(filtered, where=("prefilter", "postfilter"))
+    adam = Configuration("adam", "Adam", variants((0.2, 0.5, 0.9), {"": None}))
     post = Configuration("cross-bilateral", "Cross-bilateral", tried(guided))
     filters = (
         adam,
-        Configuration("laplacian", "Laplacian", tried(smooth())),
-        Configuration("bilateral", "Bilateral", tried(by_itself())),
+        Configuration("laplacian", "Laplacian", tried(smooth)),
+        Configuration("bilateral", "Bilateral", tried(by_itself)),
         post,
     )
-    halved = {f"levels={levels}": cross(levels) for levels in (2, 3)}
     order = (
         adam,
-        Configuration("prefilter", "Prefilter", tried(guided, prefiltered)),
+        Configuration("prefilter", "Prefilter", tried(guided, before)),
         post._replace(title="Postfilter"),
         Configuration("both", "Both, of half the passes", tried(halved, around)),
     )
@@ -67,28 +64,29 @@ def build(full: bool) -> list[Descent]:
         ),
     )
     return [
-        _descent("filters", TITLE, filters, size, also=partial(denoise, size)),
+        _descent("filters", TITLE, filters, size),
         _descent("order", f"{TITLE}: before or after the moments", order, size),
         _descent("moments", f"{TITLE}: one moment filtered, or both", moments, size),
     ]
 
 
-def _descent(name: str, title: str, configurations: tuple, size: int, **others: Any) -> Descent:
+TASKS = {"texture": TaskEntry(TITLE, "descent", build)}
+
+
+def _descent(name: str, title: str, configurations: tuple, size: int) -> Descent:
+    start = jnp.full((size, size), START)
     return Descent(
         name=name,
         title=title,
-        scene=lambda seed: scene(size),
-        start=lambda seed, scene: jnp.full((size, size), START),
-        gradient=lambda y, key, scene: plate.gradient(
-            y, key, scene["reference"], primal=16, samples=1
+        problem=problem(gradient, partial(scene, size), start, MARKS[-1], plate.LOW, plate.HIGH),
+        score=Score(
+            errors=errors, levels={"image error": (0.1, 0.03, 0.01), "roughness error": ()}
         ),
-        errors=errors,
-        score="image error",
-        configurations=configurations,
-        rates=RATES,
-        marks=MARKS,
-        levels=(0.1, 0.03, 0.01),
+        start=lambda seed: start,
         seeds=5,
+        configurations=configurations,
+        rates=(0.003, 0.01, 0.03, 0.1),
+        marks=MARKS,
         tuning_seeds=1,  # of a thousand texels' noise each
         pictures=pictures,
         target=lambda scene: {
@@ -98,7 +96,6 @@ def _descent(name: str, title: str, configurations: tuple, size: int, **others: 
         pictured=(25, 100),
         notes=f"{size} x {size} texels and pixels; 16 samples a pixel for the picture, 1 for the "
         "derivative. The image error is the squared one, relative to the start.",
-        **others,
     )
 
 
@@ -115,6 +112,10 @@ def scene(size: int) -> dict[str, jax.Array]:
     }
 
 
+def gradient(y: jax.Array, key: jax.Array, scene: dict[str, jax.Array]) -> jax.Array:
+    return plate.gradient(y, key, scene["reference"], primal=16, samples=1)
+
+
 def errors(y: jax.Array, scene: dict[str, jax.Array]) -> dict[str, jax.Array]:
     image = plate.loss(plate.exact(y, SCORED), scene["scored"]) / scene["loss"]
     roughness = jnp.sqrt(jnp.mean((y - scene["roughness"]) ** 2))
@@ -129,37 +130,9 @@ def pictures(y: jax.Array, scene: dict[str, jax.Array]) -> dict[str, Any]:
     }
 
 
-def cross(levels: int, sigma_d: float = 0.1) -> Filter:
-    return sd.filters.cross_bilateral(sigma_d, levels, ndim=2, log=True)
-
-
-def smooth() -> dict[str, Filter]:
-    return {f"lam={lam}": sd.filters.laplacian(lam, ndim=2) for lam in (1, 3, 10)}
-
-
-def by_itself() -> dict[str, Filter]:
-    return {f"sigma_d={s}": sd.filters.bilateral(s, 3, ndim=2) for s in (0.3, 1.0, 3.0)}
-
-
-def tried(
-    filters: Mapping[str, Filter | None],
-    build: Build = postfiltered,
-    b1s: Sequence[float] = DECAY,
-) -> dict[str, Optimiser]:
-    """The variants of a filter; the roughness stays in its range."""
-
-    def bounded(rate: Rate, b1: float, b2: float, filter: Filter | None) -> Transformation:
-        return optax.chain(build(rate, b1, b2, filter), keep_within(plate.LOW, plate.HIGH))
-
-    return variants(b1s, filters, bounded)
-
-
-def around(rate: Rate, b1: float, b2: float, filter: Filter) -> Transformation:
-    """Adam with its gradients and its moments filtered."""
-    return sd.filtered_adam(rate, b1, b2, eps=EPS, prefilter=filter, postfilter=filter)
-
-
-def one_moment(name: str, rate: Rate, b1: float, b2: float, filter: Filter) -> Transformation:
+def one_moment(
+    name: str, b1: float, b2: float, filter: Filter, rate: Rate
+) -> optax.GradientTransformation:
     """Adam with one of its moments filtered. Its steps have no bound, so the library lacks it."""
 
     def init(params: Any) -> Any:
@@ -173,25 +146,4 @@ def one_moment(name: str, rate: Rate, b1: float, b2: float, filter: Filter) -> T
         top, bottom = top / (1 - b1**time), bottom / (1 - b2**time)
         return -rate * top / (jnp.sqrt(bottom) + EPS), (step, m, v)
 
-    return Transformation(init, update)
-
-
-def denoise(size: int, folder: Path) -> dict[str, Any]:
-    """Draws a gradient on the way, before and after filters."""
-    found = scene(size)
-    on_the_way = START + 0.5 * (found["roughness"] - START)
-    gradient = jax.jit(
-        lambda key, primal, samples: plate.gradient(
-            on_the_way, key, found["reference"], primal=primal, samples=samples
-        ),
-        static_argnums=(1, 2),
-    )
-    exact = jnp.mean(jnp.stack([gradient(jax.random.key(i), 64, 64) for i in range(8)]), 0)
-    guided = {f"sigma_d={s}": cross(5, s) for s in (0.03, 0.1)}
-    return denoising(
-        lambda key: gradient(key, 16, 1),
-        exact,
-        on_the_way,
-        {"Laplacian": smooth(), "Bilateral": by_itself(), "Cross-bilateral": guided},
-        folder / "denoising.png",
-    )
+    return optax.GradientTransformation(init, update)

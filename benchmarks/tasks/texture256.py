@@ -8,14 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from benchmarks import methods
-from benchmarks._task import Budget, Task
+from benchmarks._task import Budget, Problem, Score, Task, TaskEntry
 
-TITLE = "Texture256: 196,608 values of a texture"
-METHODS = methods.MANY_PARAMETERS
 PIXELS = 256
 SHAPE = (PIXELS, PIXELS, 3)
-SIGMA = 0.025
 
 
 def _waves() -> np.ndarray:
@@ -31,25 +27,24 @@ REFERENCE = _waves()
 def build(full: bool) -> Task:
     """Starts are grey with a little noise."""
     reference = jnp.asarray(REFERENCE, jnp.float32)
-
-    def loss(y: Float[Array, "256 256 3"]) -> Float[Array, ""]:
-        return jnp.mean((y - reference) ** 2)
+    loss = lambda y: jnp.mean((y - reference) ** 2)
 
     def terms(y: Float[Array, "256 256 3"]) -> Float[Array, "256 256 3"]:
         return (y - reference) ** 2 / reference.size
 
+    itself = lambda y: y
+    budget = Budget(100_000, 1200) if full else Budget(2000, 120)
+    bounds = jnp.zeros(SHAPE), jnp.ones(SHAPE)
     return Task(
-        name="texture256",
-        title=TITLE,
-        loss=loss,
-        exact_loss=loss,
+        "texture256",
+        TASKS["texture256"].title,
+        Problem(bounds, 0.025, budget, loss, terms=terms, support=itself),
+        Score(reference, image=itself),
         start=lambda seed: 0.5 + 0.05 * jax.random.normal(jax.random.key(seed), SHAPE),
-        reference=reference,
-        bounds=(jnp.zeros(SHAPE), jnp.ones(SHAPE)),
-        sigma=SIGMA,
-        budget=Budget(100_000, 1200) if full else Budget(2000, 120),
         seeds=10 if full else 1,
-        image=lambda y: y,
-        terms=terms,
-        support=lambda y: y,
     )
+
+
+TASKS = {
+    "texture256": TaskEntry("Texture256: 196,608 values of a texture", "program", build),
+}

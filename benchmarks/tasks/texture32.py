@@ -9,34 +9,21 @@ spread evenly in a pixel, or four of them would not tell where the edge of a tex
 """
 
 import dataclasses
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 import smoothdiff as sd
-from benchmarks._task import Budget, Task
-from benchmarks.scenes._mitsuba_task import DIRECT, camera, flash, scene_task
+from benchmarks._task import Budget, Task, TaskEntry
+from benchmarks.scenes.mitsuba_scene import DIRECT, Description, camera, flash
+from benchmarks.tasks._scene_task import scene_task
 
 TITLE = "Texture32: 1,024 texels of a tilted poster"
-METHODS = (
-    "spsa",
-    "fr22",
-    "first_order",
-    "our_hvpa",
-    "zerograds",
-    "cma_es_diagonal",
-    "local_gradient",
-    "local_first_order",
-    "local_cross_entropy",
-    "gauss_newton",
-    "local_gauss_newton",
-)
 SIDE = 32  # texels
 TILT = 30.0  # degrees, of the poster [-1, 1]², whose lower edge is the nearer one
 DISTANCE, FIELD = 4.2, 31.0  # of the camera from the middle; degrees
-SIGMA = 0.2  # of grey
-TEXELS = "poster.bsdf.reflectance.data"
 
 
 def build(full: bool) -> Task:
@@ -47,26 +34,25 @@ def build(full: bool) -> Task:
         name="texture32",
         title=TITLE,
         scene=scene,
-        params={TEXELS: lambda y: y.reshape(SIDE, SIDE, 1)},
-        reference=texture().ravel().tolist(),
+        params={"poster.bsdf.reflectance.data": lambda y: y.reshape(SIDE, SIDE, 1)},
+        reference=texture().ravel(),
         bounds=([0.0] * size, [1.0] * size),
         start_box=([0.1] * size, [0.9] * size),
-        sigma=SIGMA,
+        sigma=0.2,  # of grey
         budget=Budget(20_000, 600) if full else Budget(4000, 120),
         resolution=resolution,
     )
-    residuals = task.residuals
+    residuals = task.problem.residuals
     assert residuals is not None
 
     def terms(y: Float[Array, "1024"]) -> Float[Array, "height width"]:
         return jnp.mean(residuals(y) ** 2, axis=-1) / resolution**2
 
-    return dataclasses.replace(
-        task, seeds=10 if full else 2, terms=terms, support=support(resolution)
-    )
+    problem = dataclasses.replace(task.problem, terms=terms, support=support(resolution))
+    return dataclasses.replace(task, seeds=10 if full else 2, problem=problem)
 
 
-def scene(world) -> dict:
+def scene(world: Any) -> Description:
     """The poster, grey, before a camera that looks at its middle."""
     import mitsuba as mi
 
@@ -115,3 +101,6 @@ def _meets(corners: np.ndarray) -> np.ndarray:
     low, high = np.floor(four.min(0)), np.floor(four.max(0))
     texel = np.arange(SIDE)
     return (low[..., None] <= texel) & (texel <= high[..., None])
+
+
+TASKS = {"texture32": TaskEntry(TITLE, "large", build)}

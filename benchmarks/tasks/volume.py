@@ -6,63 +6,62 @@ b1 is 0.2. Passes are tuned: the paper's 3 on 64Â³ voxels reach a quarter of 32Â
 our own, since the paper's belong to its units.
 """
 
-from collections.abc import Mapping, Sequence
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import optax
 
-import smoothdiff as sd
-from benchmarks.descents import (
-    Configuration,
-    Descent,
-    Optimiser,
-    Rate,
-    keep_within,
-    postfiltered,
-    variants,
-)
+from benchmarks._descent import Configuration, Descent, problem, variants
+from benchmarks._task import Score, Task, TaskEntry
 from benchmarks.scenes import smoke
 from benchmarks.scenes.smoke import Camera, Image, Volume
+from smoothdiff.filters import bilateral, cross_bilateral, laplacian
 
 TITLE = "Density and albedo of a volume, one sample a pixel"
 DENSITY, ALBEDO = 0.02, 0.5  # of the start
 REFERENCE, SCORED = 64, 4  # samples of the pictures that are sought and that are scored
-RATES = (0.01, 0.02, 0.04, 0.08)
 SIGMA_D = 0.1  # of density and of albedo, which are in [0, 1]
-DECAY = (0.2,)  # b1, the paper's best
 MARKS = (10, 25, 50)
 
 
-def build(full: bool) -> list[Descent]:
+def build(full: bool) -> list[Task]:
     size, views = (64, 32) if full else (32, 16)
-    smooth = {f"lam={lam}": _both(sd.filters.laplacian(lam, ndim=3)) for lam in (0.3, 1)}
-    by_itself = {f"levels={n}": _both(sd.filters.bilateral(1.0, n, ndim=3)) for n in (1, 2)}
-    guided = {f"levels={n}": _both(sd.filters.cross_bilateral(SIGMA_D, n, ndim=3)) for n in (1, 2)}
+    tried = partial(variants, (0.2,))  # b1, the paper's best
+    smooth = {f"lam={lam}": laplacian(lam, ndim=3) for lam in (0.3, 1)}
+    by_itself = {f"levels={n}": bilateral(1.0, n, ndim=3) for n in (1, 2)}
+    guided = {f"levels={n}": cross_bilateral(SIGMA_D, n, ndim=3) for n in (1, 2)}
     configurations = (
-        Configuration("adam", "Adam", tried({"": _both(None)}, (0.2, 0.5, 0.9))),
+        Configuration("adam", "Adam", variants((0.2, 0.5, 0.9), {"": None})),
         Configuration("laplacian", "Laplacian", tried(smooth)),
         Configuration("bilateral", "Bilateral", tried(by_itself)),
         Configuration("cross-bilateral", "Cross-bilateral", tried(guided)),
     )
+
+    def gradient(clean: bool, y: Volume, key: jax.Array, scene: dict[str, Any]) -> Volume:
+        seen = scene["camera"], scene["reference"]
+        return smoke.gradient(y, *seen, key, steps=size, clean=clean)
+
     return [
         Descent(
             name=name,
             title=f"{TITLE}, {name} gradients",
-            scene=lambda seed: scene(size, views),
-            start=lambda seed, scene: start(size),
-            gradient=lambda y, key, scene, clean=clean: smoke.gradient(
-                y, scene["camera"], scene["reference"], key, steps=size, clean=clean
+            problem=problem(
+                partial(gradient, clean), partial(scene, size, views), start(size), MARKS[-1], 0, 1
             ),
-            errors=errors,
-            score="image error",
-            configurations=configurations,
-            rates=RATES,
-            marks=MARKS,
-            levels=(0.1, 0.03, 0.01),
+            score=Score(
+                errors=errors,
+                levels={
+                    "image error": (0.1, 0.03, 0.01),
+                    "albedo error where dense": (),
+                    "density error": (),
+                },
+            ),
+            start=lambda seed: start(size),
             seeds=3,
+            configurations=configurations,
+            rates=(0.01, 0.02, 0.04, 0.08),
+            marks=MARKS,
             tuning_seeds=1,  # of tens of thousands of voxels, each with its own noise
             pictures=pictures,
             target=lambda scene: pictures(scene["volume"], scene),
@@ -71,6 +70,9 @@ def build(full: bool) -> list[Descent]:
         )
         for name, clean in (("noisy", False), ("cleaner", True))
     ]
+
+
+TASKS = {"volume": TaskEntry(TITLE, "descent", build)}
 
 
 @cache
@@ -114,28 +116,6 @@ def pictures(y: Volume, scene: dict[str, Any]) -> dict[str, Any]:
         "density, cut": y.density[size // 2, :, :, 0].T,
         "density x albedo, cut": (y.density * y.albedo)[size // 2].transpose(1, 0, 2),
     }
-
-
-def tried(filters: Mapping[str, Any], b1s: Sequence[float] = DECAY) -> dict[str, Optimiser]:
-    """The variants of a pair of filters; density and albedo stay in [0, 1]."""
-
-    def each(rate: Rate, b1: float, b2: float, filters: Any) -> optax.GradientTransformation:
-        leaves = {
-            name: postfiltered(rate, b1, b2, filter) for name, filter in filters._asdict().items()
-        }
-        names = _pair(*Volume._fields)
-        return optax.chain(optax.multi_transform(leaves, names), keep_within(0.0, 1.0))
-
-    return variants(b1s, filters, each)
-
-
-def _pair(density: Any, albedo: Any) -> Any:
-    """What belongs to density and to albedo, if it is no array."""
-    return Volume(density, albedo)
-
-
-def _both(filter: Any) -> Any:
-    return _pair(filter, filter)
 
 
 def _seen(volume: Volume, camera: Camera, size: int, samples: int) -> Image:

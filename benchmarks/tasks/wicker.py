@@ -8,19 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from benchmarks import methods
-from benchmarks._task import Budget, Task
+from benchmarks._task import Budget, Task, TaskEntry
 from benchmarks.tasks._drawn import drawn
 
-TITLE = "Wicker: integer counts of a woven texture"
-METHODS = methods.PROGRAMS
 PIXELS = 64
 FEWEST, CHOICES = np.array([2, 2, 1]), np.array([8, 8, 4])  # upright stakes, others, repetitions
 COUNTS = np.array([4, 6, 2])  # those that are sought
 REFERENCE = (COUNTS - FEWEST + 0.5) / CHOICES
 RIM, DARK = 0.06, 0.1  # around each repetition
 UPRIGHT, ACROSS = (0.9, 0.6, 0.3), (0.6, 0.35, 0.2)
-SIGMA = 0.33
 
 
 def counts(y: Float[Array, "3"]) -> Float[Array, "3"]:
@@ -51,10 +47,10 @@ def draw(y: Float[Array, "3"]) -> Float[Array, "64 64 3"]:
 def build(full: bool) -> Task:
     return drawn(
         "wicker",
-        TITLE,
+        TASKS["wicker"].title,
         draw,
         REFERENCE,
-        sigma=SIGMA,
+        sigma=0.33,
         budget=Budget(3000, 240) if full else Budget(600, 60),
         seeds=10 if full else 3,
         image=draw,
@@ -62,3 +58,6 @@ def build(full: bool) -> Task:
         optimum=0.0,
         notes=f"{PIXELS} x {PIXELS} pixels",
     )
+
+
+TASKS = {"wicker": TaskEntry("Wicker: integer counts of a woven texture", "program", build)}

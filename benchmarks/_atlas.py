@@ -1,0 +1,87 @@
+"""Small pictures of the first start: where it began, what each method found, what is sought.
+
+They are part of the results, as text, so that pages and figures need to render nothing. None is
+picked by hand.
+"""
+
+import base64
+import io
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from PIL import Image
+
+from benchmarks._loop import Runs, able
+from benchmarks._task import Task
+
+LARGEST = 128  # pixels along the longer side
+WHITE = 99.5  # percent of the start's differences that are less than white
+
+
+class Pictures(NamedTuple):
+    """As a screen shows them, (H, W, 3), from 0 to 1."""
+
+    start: np.ndarray
+    found: dict[str, np.ndarray]
+    reference: np.ndarray
+
+
+def rendered(task: Task, runs: Runs) -> str | None:
+    """The pictures below one another, a PNG as text; None where the task has no picture."""
+    image, ran = task.score.image, able(runs)
+    if image is None or not ran:
+        return None
+    unravel = ravel_pytree(task.problem.like)[1]
+    found = [unravel(jnp.asarray(each[0]["found"])) for each in ran.values()]
+    shown = [task.start(int(next(iter(ran.values()))[0]["seed"])), *found, task.score.reference]
+    return png(np.concatenate([_small(display(image(y))) for y in shown]))
+
+
+def stored(task: dict[str, Any], names: list[str]) -> Pictures | None:
+    """The pictures of a task's results, whose methods are `names`; None where there are none."""
+    if not task.get("pictures"):
+        return None
+    with Image.open(io.BytesIO(base64.b64decode(task["pictures"]))) as whole:
+        tiles = np.asarray(whole.convert("RGB")) / 255
+    start, *found, reference = np.split(tiles, len(names) + 2)
+    return Pictures(start, dict(zip(names, found, strict=True)), reference)
+
+
+def differences(pictures: Pictures) -> dict[str, np.ndarray]:
+    """How far each is from the reference, (H, W); white is as far as the start is, at most."""
+    away = lambda picture: np.abs(picture - pictures.reference).mean(axis=2)
+    white = max(np.percentile(away(pictures.start), WHITE), 1 / 255)
+    return {
+        name: np.clip(away(picture) / white, 0, 1)
+        for name, picture in {"": pictures.start, **pictures.found}.items()
+    }
+
+
+def display(image) -> np.ndarray:
+    """Linear RGB as a screen shows it."""
+    linear = np.clip(np.asarray(image), 0, 1)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def png(picture: np.ndarray) -> str:
+    """A PNG of a picture, as text."""
+    written = io.BytesIO()
+    _image(picture).save(written, "png", optimize=True)
+    return base64.b64encode(written.getvalue()).decode()
+
+
+def data_uri(text: str) -> str:
+    """A PNG as text, as the source of an <img>."""
+    return f"data:image/png;base64,{text}"
+
+
+def _image(picture: np.ndarray) -> Image.Image:
+    return Image.fromarray(np.rint(255 * picture).astype(np.uint8))
+
+
+def _small(picture: np.ndarray) -> np.ndarray:
+    image = _image(picture)
+    image.thumbnail((LARGEST, LARGEST), Image.Resampling.LANCZOS)  # no larger than it was
+    return np.asarray(image) / 255

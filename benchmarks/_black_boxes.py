@@ -1,0 +1,85 @@
+"""Tasks that are black boxes, as a study: what is measured on them, drawn and shown."""
+
+from argparse import Namespace
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from benchmarks import _atlas, _loop, _registry
+from benchmarks._pictures import draw
+from benchmarks._summary import summarise
+from benchmarks._tables import compare, tables
+from benchmarks._task import Method, NotAble, Problem, Solve, precision_of
+
+__all__ = ["compare", "draw", "forgiving", "measure", "tables", "usual"]
+
+
+def usual(name: str, options: Namespace) -> list[str]:
+    """The methods that were asked for, or those that run on such a task unasked."""
+    if options.methods:
+        return options.methods.split(",")
+    return _registry.methods(None if options.full else _registry.task(name).kind)
+
+
+def measure(name: str, options: Namespace, folder: Path, bar: tqdm | None = None) -> dict[str, Any]:
+    """Runs methods on a task, or on each task of a family.
+
+    Args:
+        name: The name of the task.
+        options: The command line's: methods, full, seeds and fresh.
+        folder: Where the files of the runs are.
+        bar: The bar of several scenes. With it, a method that fails is named like one that is
+            not able, and the others go on.
+    """
+    entry = _registry.task(name)
+    built = entry.build(options.full)
+    methods = [_registry.method(method) for method in usual(name, options)]
+    if bar is not None:
+        methods = [_forgiven(method) for method in methods]
+    tasks = {}
+    for task in built if isinstance(built, list) else [built]:
+        runs = _loop.run(
+            task,
+            methods,
+            range(options.seeds or task.seeds),
+            folder / "raw" / task.name,
+            setting="full" if options.full else "quick",
+            fresh=options.fresh,
+            progress=True if bar is None else bar,
+        )
+        with precision_of(task):
+            tasks[task.name] = summarise(task, runs) | {"pictures": _atlas.rendered(task, runs)}
+    return {"title": entry.title, "tasks": tasks}
+
+
+def _forgiven(method: Method) -> Method:
+    """The same method; where it fails it is not able."""
+
+    def prepare(problem: Problem) -> Solve:
+        with forgiving():
+            solve = method.prepare(problem)
+
+        def forgiven(y0, key, record):
+            with forgiving():
+                solve(y0, key, record)
+
+        return forgiven
+
+    return method._replace(prepare=prepare)
+
+
+@contextmanager
+def forgiving() -> Iterator[None]:
+    """Makes of any failure a NotAble that says that it failed."""
+    try:
+        yield
+    except (NotAble, _loop.Stop):
+        raise
+    except Exception as error:
+        if "KeyboardInterrupt" in str(error):  # in a callback it has lost its type
+            raise KeyboardInterrupt from error
+        lines = str(error).splitlines() or [""]
+        raise NotAble(f"failed: {type(error).__name__}: {lines[0][:200].rstrip('.')}") from error

@@ -1,0 +1,246 @@
+"""Descents as a study: configurations are tuned and run, and what they reached is drawn and shown.
+
+Each is tuned over the same small grid of variants and learning rates, on seeds that are not
+scored, and is then run from the scored ones.
+"""
+
+import math
+from argparse import Namespace
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from textwrap import fill
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from tqdm import tqdm
+
+from benchmarks import _loop, _registry
+from benchmarks._atlas import display
+from benchmarks._descent import Configuration, Descent, methods
+from benchmarks._grid import Grid, Row, spread
+from benchmarks._style import COLOURS, figure, legend, looks
+from benchmarks._summary import cost_to_level, quartiles
+from benchmarks._task import Budget, Method, precision_of
+
+TUNING_SEED = 1000  # the first of those that are not scored
+FILES = {"iterations": "error-vs-iterations.png", "seconds": "error-vs-time.png"}
+FLOOR = 1e-9  # the smallest error drawn, relative to the largest
+BRIGHTEST = 99  # percentile of a grey picture that is shown as white
+
+
+def measure(name: str, options: Namespace, folder: Path, bar: tqdm | None = None) -> dict[str, Any]:
+    """Compares the configurations of a task, or of each task of a family.
+
+    Args:
+        name: The name of the task.
+        options: The command line's: full, seeds and fresh.
+        folder: Where the files of the runs are, and pictures of what the first start found.
+        bar: The bar of several tasks, or None.
+    """
+    entry = _registry.task(name)
+    built = entry.build(options.full)
+    family = {task.name: task for task in (built if isinstance(built, list) else [built])}
+    run = partial(
+        _loop.run,
+        folder=folder / "raw",
+        setting="full" if options.full else "quick",
+        fresh=options.fresh,
+        progress=True if bar is None else bar,
+    )
+    tasks = {}
+    for member, task in family.items():
+        assert isinstance(task, Descent)
+        shared = replace(task, name=name)  # a family has runs in common
+        with precision_of(task):
+            into = _folder(folder, member, family)
+            tasks[member] = compared(shared, options.seeds or task.seeds, run, into)
+    return {"title": entry.title, "tasks": tasks}
+
+
+def compared(
+    task: Descent, starts: int, run: Callable[..., _loop.Runs], folder: Path
+) -> dict[str, Any]:
+    """What the results say of a task. What the first start found is drawn into a folder."""
+    choices = [tune(task, each, run) for each in task.configurations]
+    chosen, pictured = [method for method, _ in choices], task.pictured or task.marks[-1:]
+    found = _loop.able(run(task, chosen, range(starts), keep=pictured))
+    for mark in pictured if task.pictures else ():
+        firsts = {method.title: runs[0][f"found {mark}"] for method, runs in found.items()}
+        _draw_found(task, firsts, folder / f"pictures-{mark}.png")
+    return {
+        "title": task.title,
+        "notes": task.notes,
+        "score": task.scored,
+        "starts": starts,
+        "tuning_seeds": task.tuning_seeds,
+        "configurations": {
+            each.name: {"title": each.title, **choice, **_of_runs(task, found[method])}
+            for each, (method, choice) in zip(task.configurations, choices, strict=True)
+        },
+    }
+
+
+def tune(
+    task: Descent, configuration: Configuration, run: Callable[..., _loop.Runs]
+) -> tuple[Method, dict[str, Any]]:
+    """The variant and the rate with the lowest error, the geometric mean over the tuning seeds.
+
+    Beside the method it gives what the results say of the choice.
+    """
+    budget = Budget(configuration.tuned_at or task.marks[-1], math.inf)
+    until = replace(task, problem=replace(task.problem, budget=budget))
+    candidates = methods(task, configuration)
+    seeds = range(TUNING_SEED, TUNING_SEED + task.tuning_seeds)
+    found = _loop.able(run(until, list(candidates.values()), seeds))
+    tried: dict[str, dict[float, float]] = {variant: {} for variant in configuration.variants}
+    for (variant, rate), method in candidates.items():
+        logs = [np.log(one[task.scored][-1]) for one in found[method]]
+        tried[variant][rate] = float(np.exp(np.mean(logs)))
+    variant, rate = min(candidates, key=lambda candidate: tried[candidate[0]][candidate[1]])
+    at_edge = rate in (task.rates[0], task.rates[-1])
+    choice = {"variant": variant, "rate": rate, "at_edge": at_edge, "tried": tried}
+    return candidates[variant, rate], choice
+
+
+def _of_runs(task: Descent, runs: list[_loop.Run]) -> dict[str, Any]:
+    """Errors at the iterations at which runs were looked at, and at the marks."""
+    iterations = runs[0]["evaluations"].tolist()
+    errors = {name: np.stack([run[name] for run in runs]) for name in task.score.levels}
+    took = lambda level: [cost_to_level(e, iterations, level) for e in errors[task.scored]]
+    return {
+        "iterations": iterations,
+        "seconds": np.median([run["seconds"] for run in runs], axis=0).tolist(),
+        "curves": {
+            name: np.quantile(each, [0.25, 0.5, 0.75], axis=0, method="higher").tolist()
+            for name, each in errors.items()
+        },
+        "at_marks": {
+            name: {mark: quartiles(list(each[:, iterations.index(mark)])) for mark in task.marks}
+            for name, each in errors.items()
+        },
+        "to_levels": {level: quartiles(took(level)) for level in task.score.levels[task.scored]},
+        "ms_an_iteration": quartiles([1e3 * run["seconds"][-1] / iterations[-1] for run in runs]),
+    }
+
+
+def tables(results: dict[str, Any]) -> Iterator[Grid]:
+    """Of each task: errors at the marks, a table for each error, and what the levels took."""
+    for task in results["tasks"].values():
+        configurations = list(task["configurations"].values())
+        for error, marks in configurations[0]["at_marks"].items():
+            yield Grid(
+                title=f"{task['title']}: {error}",
+                caption="Median [quartiles] over the starts, after so many iterations.",
+                columns=("configuration", *marks),
+                rows=tuple(
+                    Row(found["title"], tuple(map(spread, found["at_marks"][error].values())))
+                    for found in configurations
+                ),
+            )
+        yield _to_levels(task, configurations)
+
+
+def _to_levels(task: dict[str, Any], configurations: list[dict[str, Any]]) -> Grid:
+    usual = configurations[0]["ms_an_iteration"]["median"]
+    rows = []
+    for found in configurations:
+        edge = "*" if found["at_edge"] else ""
+        extra = found["ms_an_iteration"]["median"] / usual - 1
+        levels = map(spread, found["to_levels"].values())
+        time = spread(found["ms_an_iteration"]), f"{100 * extra:.0f} %"
+        cells = (*levels, f"{found['rate']:g}{edge}", found["variant"], *time)
+        rows.append(Row(found["title"], cells))
+    levels = configurations[0]["to_levels"]
+    return Grid(
+        title=f"Iterations until the {task['score']} is at most",
+        caption="The rate was tuned on other starts; * is the end of the grid. - is not reached. "
+        "Extra time is that of an iteration over the first line's.",
+        columns=("configuration", *levels, "rate", "variant", "ms/iteration", "extra time"),
+        rows=tuple(rows),
+    )
+
+
+def compare(results: dict[str, Any], committed: dict[str, Any]) -> Iterator[Grid]:
+    """The tables of the committed results: they are of the same form, to be read beside these."""
+    for grid in tables(committed):
+        yield grid._replace(title=f"Committed: {grid.title}", caption=committed["machine"]["cpu"])
+
+
+def draw(results: dict[str, Any], folder: Path) -> None:
+    """Draws the errors against iterations and seconds."""
+    for name, task in results["tasks"].items():
+        for cost, file in FILES.items():
+            _curves(task, cost, _folder(folder, name, results["tasks"]) / file)
+
+
+def _folder(folder: Path, name: str, family: Collection[str]) -> Path:
+    """Each task of a family has its own."""
+    return folder / name if len(family) > 1 else folder
+
+
+def _curves(task: dict[str, Any], cost: str, path: Path) -> None:
+    """Median and quartiles over the starts, a panel for each error."""
+    configurations = task["configurations"]
+    look = looks(configurations)
+    errors = list(next(iter(configurations.values()))["curves"])
+    with figure(path, 1, len(errors), (4.5 * len(errors), 3.8)) as (drawn, axes):
+        for axis, error in zip(axes[0], errors, strict=True):
+            for name, found in configurations.items():
+                costs = found[cost][1:]
+                low, middle, high = np.array(found["curves"][error], float)[:, 1:]  # None is NaN
+                axis.plot(costs, middle, label=found["title"], **look[name])
+                colour = look[name]["color"]
+                axis.fill_between(costs, low, high, color=colour, alpha=0.15, lw=0)
+            bottom, top = axis.dataLim.intervaly
+            axis.set(xscale="log", xlabel=cost.capitalize(), title=error)
+            axis.set(yscale="log", ylim=(max(bottom, FLOOR * top) / 1.3, 1.3 * top))
+        legend(drawn, *axes[0, 0].get_legend_handles_labels())
+        title = f"{task['title']}\nMedian and quartiles over {task['starts']} starts"
+        drawn.suptitle(title, x=0.01, ha="left", fontsize=10)
+
+
+def _draw_found(task: Descent, found: dict[str, np.ndarray], path: Path) -> None:
+    """A column of pictures for each y found, by title, between the start's and the target's.
+
+    A line is drawn over the target's. A row of grey pictures has one scale: that of the target if
+    it has the picture, and else of all.
+    """
+    assert task.pictures is not None
+    scene, unravel = task.scene(0), ravel_pytree(task.problem.like)[1]
+    ys = {"Start": task.start(0)} | {title: unravel(jnp.asarray(y)) for title, y in found.items()}
+    columns = {title: task.pictures(y, scene) for title, y in ys.items()}
+    names, sought = list(columns["Start"]), task.target(scene)
+    columns["Target"] = sought
+    width = 2.4 if any(np.ndim(picture) == 1 for picture in sought.values()) else 1.7
+    size = width * len(columns), 1.75 * len(names) + 0.3
+    with figure(path, len(names), len(columns), size) as (_, axes):
+        for line, name in zip(axes, names, strict=True):
+            shown = [np.asarray(of[name]) for of in columns.values() if name in of]
+            low, high = np.min(shown), np.percentile(shown, BRIGHTEST)
+            if name in sought:
+                low, high = np.min(shown[-1]), np.max(shown[-1])
+            for axis in line:
+                axis.set(xticks=[], yticks=[])
+                axis.grid(visible=False)
+                axis.spines[:].set_visible(False)
+            for axis, picture in zip(line, shown, strict=False):
+                _show(axis, picture, shown[-1], low, high)
+            line[0].set_ylabel(name)
+        for axis, title in zip(axes[0], columns, strict=True):
+            axis.set_title(fill(title, 20), fontsize=8, loc="center")
+
+
+def _show(axis, picture: np.ndarray, sought: np.ndarray, low: float, high: float) -> None:
+    if picture.ndim == 1:
+        margin = 0.15 * (high - low)
+        axis.plot(sought, color="0.7", lw=2.5)
+        axis.plot(picture, color=COLOURS[1], lw=0.8)
+        axis.set_ylim(low - margin, high + margin)
+    elif picture.ndim == 2:
+        axis.imshow(picture, cmap="gray", vmin=low, vmax=high, interpolation="nearest")
+    else:
+        axis.imshow(display(picture), interpolation="nearest")

@@ -1,0 +1,312 @@
+"""The run loop: each method from each start, counted, stopped, scored, and kept on disk.
+
+A run is one method from one start. It is written as soon as it ends, so that an interrupted
+benchmark goes on where it was.
+"""
+
+import dataclasses
+import itertools
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from tqdm import tqdm
+
+from benchmarks._kept import fingerprint, kept
+from benchmarks._task import Method, NativeAD, NotAble, Problem, Solve, Task, Y, precision_of
+
+CLOSED = 1e-8  # the smallest gap that is scored
+GROWTH = 1.1  # a trace keeps a point when the evaluations have grown by this factor
+WARM_UP_SEED = 1_000_003  # a start that is not in any ensemble
+WARM_UP_ITERATIONS = 3
+
+Run = dict[str, Any]  # seed, ended, warm_up_seconds, evaluations, seconds, an array for each error
+Runs = dict[Method, list[Run] | NotAble]
+
+
+class Stop(Exception):
+    """Raised by `record` to stop a method; says what ended the run."""
+
+
+class Counter:
+    """Counts on the host what is evaluated inside jit, vmap and scan.
+
+    The first number of the value passes through a callback that gives it back as it is. So a call
+    is counted if and only if its value is used, whatever the function is made of. Not the whole
+    value: on one core JAX may hang where it is to hand more than 100 kB to a callback.
+    """
+
+    def __init__(self):
+        self.evaluations = 0
+
+    def watched(self, problem: Problem) -> Problem:
+        """The problem as the methods see it: whatever evaluates it is counted."""
+        seen: dict[str, Any] = {
+            name: self.watch(fun)
+            for name in ("loss", "residuals", "terms")
+            if (fun := getattr(problem, name)) is not None
+        }
+        if (grey := problem.grey) is not None:
+            seen["grey"] = grey._replace(render=self.watch(grey.render))
+            seen["loss"] = seen["grey"].loss
+        if (native_ad := problem.native_ad) is not None:
+            seen["native_ad"] = lambda: self._watch_native_ad(native_ad())
+        return dataclasses.replace(problem, **seen)
+
+    def watch(self, fun: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
+        """The same function of y, counted: one for each y, whatever the size of the value."""
+
+        def counted(*y: Y) -> jax.Array:
+            value = fun(*y)
+            flat = value.ravel()
+            out = jax.ShapeDtypeStruct((), value.dtype)
+            first = jax.pure_callback(self._let_pass, out, flat[0], vmap_method="expand_dims")
+            return flat.at[0].set(first).reshape(value.shape)
+
+        return counted
+
+    def _watch_native_ad(self, native_ad: NativeAD) -> NativeAD:
+        """The same; a gradient costs two: the picture and the pass back."""
+
+        def counted(y: Y) -> tuple[Any, Y]:
+            self.evaluations += 2
+            return native_ad(y)
+
+        return counted
+
+    def _let_pass(self, first):
+        first = np.asarray(first)
+        self.evaluations += first.size
+        return first
+
+
+class Recorder:
+    """Stamps each y with the evaluations and seconds so far, and ends the run in time.
+
+    Of the points it keeps about 25 for each factor of ten in evaluations, and always the last. A
+    run ends early where `gap(y)` is at the last level: nothing would be scored after it.
+    """
+
+    def __init__(
+        self,
+        counter: Counter,
+        problem: Problem,
+        y0: Y,
+        iterations: float = np.inf,
+        gap: Callable[[Y], float] | None = None,
+    ):
+        self._counter, self._budget, self._iterations = counter, problem.budget, iterations
+        self._gap = gap
+        self.trace = [(0, 0.0, flat(y0))]
+        self._last = self.trace[0]
+        counter.evaluations = 0
+        self._began = time.perf_counter()
+
+    def __call__(self, y: Y, iterations: int | None = None) -> None:
+        """Takes the y of an iteration; raises Stop after the last one."""
+        found = flat(y)  # waits for the evaluations behind y
+        seconds = time.perf_counter() - self._began
+        evaluations = self._counter.evaluations if iterations is None else iterations
+        self._last = (evaluations, seconds, found)
+        if iterations is not None or evaluations >= GROWTH * self.trace[-1][0]:
+            self.trace.append(self._last)
+        self._iterations -= 1
+        spent = evaluations >= self._budget.evaluations or seconds >= self._budget.seconds
+        if spent or self._iterations <= 0:
+            raise Stop("by the budget")
+        if self._gap is not None:
+            solved = self._gap(y) <= CLOSED
+            self._began += time.perf_counter() - self._began - seconds  # that was not the method's
+            if solved:
+                raise Stop("at the optimum")
+
+    def finish(self) -> list[tuple[int, float, np.ndarray]]:
+        """The points kept, with the last one."""
+        if self.trace[-1] is not self._last:
+            self.trace.append(self._last)
+        return self.trace
+
+
+def run(
+    task: Task,
+    methods: Sequence[Method],
+    seeds: Sequence[int],
+    folder: Path,
+    *,
+    setting: str = "quick",
+    fresh: bool = False,
+    progress: bool | tqdm = True,
+    keep: Collection[int] = (),
+) -> Runs:
+    """Runs each method from each start, unless its file is there and is still valid.
+
+    All methods run from one start before the next, so that what else the machine does at the time
+    falls on all of them.
+
+    Args:
+        task: The task.
+        methods: The methods.
+        seeds: The starts.
+        folder: Where the files of the runs are.
+        setting: "quick" or "full", a part of their names.
+        fresh: Run again what has been run.
+        progress: Show a bar, or go on with this one.
+        keep: After so many evaluations what a run found is kept too, beside the last.
+
+    Returns:
+        The runs of each method, or why it is not able.
+    """
+    counter = Counter()
+    problem = counter.watched(task.problem)
+    prepared: dict[Method, tuple[Solve, float]] = {}
+    exact_loss = jax.jit(lambda y: task.exact_loss(y))  # there may be none
+
+    def make(method: Method, seed: int) -> Run:
+        if method not in prepared:
+            prepared[method] = _warm_up(task, problem, method, counter)
+        solve, warm_up = prepared[method]
+        scored = _solve(task, problem, solve, seed, counter, exact_loss, keep)
+        return {"warm_up_seconds": warm_up} | scored
+
+    def obtain(method: Method, seed: int) -> Run:
+        path = folder / f"{method.name}-{seed}-{setting}.npz"
+        stale = fingerprint(behaviour, method.source, sorted(keep))
+        return kept(path, stale, lambda: make(method, seed), fresh)
+
+    runs: dict[Method, list[Run]] = {method: [] for method in methods}
+    not_able: dict[Method, NotAble] = {}
+    with precision_of(task), _bar(progress, len(methods) * len(seeds)) as bar:
+        behaviour = _behaviour(task)
+        for seed, method in itertools.product(seeds, methods):
+            bar.set_description(f"{task.name}: start {seed}, {method.name}")
+            if method not in not_able:
+                try:
+                    runs[method].append(obtain(method, seed))
+                except NotAble as reason:
+                    not_able[method] = reason
+            bar.update()
+    return runs | not_able
+
+
+def able(runs: Runs) -> dict[Method, list[Run]]:
+    """Those of the methods that ran."""
+    return {method: found for method, found in runs.items() if isinstance(found, list)}
+
+
+def flat(y: Y) -> np.ndarray:
+    """All parameters as one vector."""
+    return np.concatenate([np.ravel(np.asarray(leaf)) for leaf in jax.tree.leaves(y)])
+
+
+def _bar(progress: bool | tqdm, runs: int) -> AbstractContextManager[tqdm]:
+    if isinstance(progress, tqdm):
+        return nullcontext(progress)
+    return tqdm(total=runs, disable=not progress, unit="run")
+
+
+def _warm_up(task: Task, problem: Problem, method: Method, counter: Counter) -> tuple[Solve, float]:
+    """Prepares a method and lets it compile on a start of its own, which is not charged to it."""
+    began = time.perf_counter()
+    solve = method.prepare(problem)
+    _record(task, problem, solve, WARM_UP_SEED, counter, iterations=WARM_UP_ITERATIONS)
+    return solve, time.perf_counter() - began
+
+
+def _record(
+    task: Task,
+    problem: Problem,
+    solve: Solve,
+    seed: int,
+    counter: Counter,
+    iterations: float = np.inf,
+    gap: Callable[[Y], float] | None = None,
+) -> tuple[list[tuple[int, float, np.ndarray]], str]:
+    """The trace of a run, and why it ended."""
+    if task.choose is not None:
+        task.choose(seed)
+    y0 = task.start(seed)
+    recorder = Recorder(counter, problem, y0, iterations, gap)
+    ended = "by the method"
+    try:
+        solve(y0, jax.random.key(seed), recorder)
+    except Stop as stop:
+        ended = str(stop)
+    return recorder.finish(), ended
+
+
+def _solve(
+    task: Task,
+    problem: Problem,
+    solve: Solve,
+    seed: int,
+    counter: Counter,
+    exact_loss: Callable[[Y], jax.Array],
+    keep: Collection[int],
+) -> Run:
+    """One run with its scores."""
+    lowest = task.score.optimum
+    above = None if lowest is None else lambda y: float(exact_loss(y)) - lowest
+    trace, ended = _record(task, problem, solve, seed, counter, gap=above)
+    unravel = ravel_pytree(task.problem.like)[1]
+    evaluations, seconds, ys = zip(*trace, strict=True)
+    points = [unravel(y) for y in ys]
+    errors = _errors if task.score.errors is None else _own_errors
+    return {
+        "seed": seed,
+        "ended": ended,
+        "evaluations": np.array(evaluations),
+        "seconds": np.array(seconds),
+        **errors(task, points, seed, exact_loss),
+        "found": ys[-1],
+        **{f"found {n}": y for n, y in zip(evaluations, ys, strict=True) if n in keep},
+    }
+
+
+def _errors(task: Task, points: list[Y], seed: int, exact_loss: Callable) -> Mapping[str, Any]:
+    """Errors relative to those of the start, except for the gap."""
+    score = task.score
+    gap = np.array([float(exact_loss(y)) for y in points]) - (score.optimum or 0.0)
+    sought = score.reference if task.choose is None else task.choose(seed)
+    if score.distance is None:
+        distance = np.array([np.linalg.norm(flat(y).astype(float) - flat(sought)) for y in points])
+    else:
+        away = jax.jit(score.distance)
+        distance = np.array([float(away(y)) for y in points])
+    return {
+        "image_error": gap / gap[0],
+        "parameter_error": distance / distance[0],
+        **({} if score.optimum is None else {"gap": gap}),
+        "distance": float(distance[-1]),
+    }
+
+
+def _own_errors(task: Task, points: list[Y], seed: int, exact_loss: Callable) -> Mapping[str, Any]:
+    assert task.score.errors is not None
+    errors, scene = jax.jit(task.score.errors), task.problem.scene()
+    each = [errors(y, scene) for y in points]
+    found = {name: np.array([float(one[name]) for one in each]) for name in each[0]}
+    return {name: np.where(np.isnan(of), np.inf, of) for name, of in found.items()}  # it diverged
+
+
+def _behaviour(task: Task) -> str:
+    """Changes when the task does: its settings, and what its black box says at two points."""
+    if task.choose is not None:
+        task.choose(0)
+    problem, score = task.problem, task.score
+    points = [y for y in (task.start(0), score.reference) if y is not None]
+    said: list[Any] = [task.name, problem.budget, problem.sigma, task.notes]
+    said += [fingerprint(*(flat(y) for y in (*points, *problem.bounds)))]
+    for fun in (problem.loss, score.distance):
+        if fun is not None:
+            said += [[flat(fun(y)).tolist() for y in points]]
+    if score.errors is not None:
+        said.append(flat(jax.jit(score.errors)(points[0], problem.scene())).tolist())
+    if problem.gradient is not None:
+        slope = jax.jit(problem.gradient)(points[0], jax.random.key(0), problem.scene())
+        said.append(float(np.linalg.norm(flat(slope))))
+    return repr(said)

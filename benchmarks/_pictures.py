@@ -1,0 +1,169 @@
+"""The results of a task as pictures: errors against costs, and what each method found."""
+
+import math
+from collections.abc import Container
+from itertools import groupby
+from pathlib import Path
+from textwrap import fill
+from typing import Any
+
+import numpy as np
+
+from benchmarks._atlas import stored
+from benchmarks._grid import short
+from benchmarks._style import CROWDED, figure, legend, looks
+from benchmarks._summary import COSTS, GAPS, LEVELS, able, grid
+
+FLOORS = {"image_error": 1e-7, "parameter_error": 1e-7, "gap": 1e-10}  # the smallest error drawn
+ABREAST = 10  # square pictures in a line
+SQUARE, TEXT = 1.7, 0.5  # inches: the side of such a picture, and two lines of text
+GAP = min(GAPS, key=lambda name: GAPS[name])  # that families are compared at
+COLUMNS = 4  # of a family's panels
+FEWEST = 5  # evaluations that are drawn
+LABELS = {
+    "image_error": "Image error (loss), relative to the start",
+    "parameter_error": "Parameter error, relative to the start",
+    "gap": "Loss above its lowest value",
+    "evaluations": "Evaluations",
+    "seconds": "Seconds",
+}
+FILES = {"evaluations": "error-vs-evaluations.png", "seconds": "error-vs-time.png"}
+
+
+def draw(results: dict[str, Any], folder: Path) -> None:
+    """Draws what there is to draw; each task of a family into a folder of its own."""
+    tasks = {name: task for name, task in results["tasks"].items() if able(task)}
+    for name, task in tasks.items():
+        into = folder / name if len(results["tasks"]) > 1 else folder
+        for cost in COSTS if _has_curves(task) else ():
+            _curves(task, cost, into / FILES[cost])
+        _images(task, into / "images.png")
+    if len(tasks) > 1 and all("gap" in errors_of(task) for task in tasks.values()):
+        _family(results, folder / "evaluations.png")
+
+
+def errors_of(task: dict[str, Any]) -> list[str]:
+    """The errors by which the methods were scored."""
+    return [error for error in LEVELS if any(error in f["final"] for f in able(task).values())]
+
+
+def ours_of(methods: dict[str, Any]) -> list[str]:
+    """Those that are this library's."""
+    return [name for name, found in methods.items() if "(ours)" in found["title"]]
+
+
+def _has_curves(task: dict[str, Any]) -> bool:
+    curves = [found["curves"] for found in able(task).values()]
+    return any(curve["ends"] for each in curves for of in each.values() for curve in of.values())
+
+
+def _curves(task: dict[str, Any], cost: str, path: Path) -> None:
+    """Median and quartiles over the starts, a panel for each error."""
+    methods, errors = able(task), errors_of(task)
+    strong = ours_of(methods) if len(methods) > CROWDED else []
+    look = looks(methods, strong)
+    with figure(path, 1, len(errors), (4.5 * len(errors), 3.8)) as (drawn, axes):
+        for axis, error in zip(axes[0], errors, strict=True):
+            panel(axis, methods, look, error, cost, strong or methods)
+        count = max(found["starts"] for found in methods.values())
+        starts = "1 start" if count == 1 else f"{count} starts"
+        what = "medians, quartiles of ours," if strong else "median and quartiles"
+        legend(drawn, *axes[0, 0].get_legend_handles_labels())
+        title = f"{task['title']}: {what} over {starts}"
+        drawn.suptitle(title, x=0.01, ha="left", fontsize=10)
+
+
+def panel(
+    axis,
+    methods: dict[str, Any],
+    look: dict[str, dict],
+    error: str,
+    cost: str,
+    banded: Container[str],
+) -> None:
+    """Median of one error over the starts, against what they cost; quartiles for those `banded`."""
+    lowest, highest = 0.1, 1.0
+    for name, found in methods.items():
+        curve = found["curves"][error][cost]
+        if curve["ends"] is None:
+            continue
+        costs = grid(curve["ends"])
+        quartiles = np.nan_to_num(np.array(curve["quartiles"], float), nan=np.inf)
+        low, middle, high = np.maximum(quartiles, FLOORS[error])
+        axis.plot(costs, middle, label=found["title"], **look[name])
+        if name in banded:
+            axis.fill_between(costs, low, high, color=look[name]["color"], alpha=0.15, lw=0)
+        shown = middle[np.isfinite(middle)]
+        lowest, highest = min(lowest, *shown), max(highest, *shown)
+    axis.set(ylim=(lowest / 1.3, highest * 1.3))
+    axis.set(xscale="log", yscale="log", xlabel=LABELS[cost], title=LABELS[error])
+    for level in (level for level in LEVELS[error].values() if level >= lowest):
+        axis.axhline(level, color="0.6", lw=0.6, ls=":", zorder=0)
+
+
+def _images(task: dict[str, Any], path: Path) -> None:
+    """Start, found by each method, and reference, from the first start: none is picked by hand."""
+    methods = able(task)
+    pictures = stored(task, list(methods))
+    if pictures is None:
+        return
+    shown = [pictures.start, *pictures.found.values(), pictures.reference]
+    errors = ["1", *(short(found["first"]) for found in methods.values()), "0"]
+    names = ["Start", *(found["title"] for found in methods.values()), "Reference"]
+    # each as large as a square one, in lines of about the same length
+    tall = math.sqrt(shown[0].shape[0] / shown[0].shape[1])
+    lines = -(-len(shown) // max(1, int(ABREAST * tall)))
+    columns = -(-len(shown) // lines)
+    size = SQUARE / tall * columns, (SQUARE * tall + TEXT) * lines + 0.6
+    with figure(path, lines, columns, size) as (_, axes):
+        for axis in axes.flat:
+            axis.set(xticks=[], yticks=[])
+            axis.spines[:].set_visible(False)
+        for axis, picture, name, error in zip(axes.flat, shown, names, errors, strict=False):
+            axis.imshow(picture, interpolation="nearest")
+            axis.set_xlabel(f"error {error}")
+            axis.set_title(fill(name, 20), fontsize=8, loc="center")
+
+
+def _family(results: dict[str, Any], path: Path) -> None:
+    """Evaluations to the smallest gap against dimensions, a panel for each function."""
+    tasks = results["tasks"]
+    titles = {name: found["title"] for task in tasks.values() for name, found in able(task).items()}
+    look = looks(titles)
+    panels = groupby(tasks.items(), key=lambda item: item[0].rpartition("-")[0])
+    functions = [(name, [task for _, task in members]) for name, members in panels]
+    columns = min(COLUMNS, len(functions))
+    rows = -(-len(functions) // columns)
+    most = max(task["budget"]["evaluations"] for task in tasks.values())
+    with figure(path, rows, columns, (max(6, 3 * columns), 2.8 * rows + 0.6)) as (drawn, axes):
+        for axis in axes.flat[len(functions) :]:
+            axis.set_visible(False)
+        for axis, (function, members) in zip(axes.flat, functions, strict=False):
+            for method in titles:
+                _medians(axis, [task for task in members if method in able(task)], method, look)
+            dimensions = [task["dimensions"] for task in members]
+            axis.set(xscale="log", yscale="log", ylim=(FEWEST, 1.5 * most), title=function)
+            axis.set_xticks(dimensions, [f"{n}-D" for n in dimensions])
+            axis.xaxis.minorticks_off()
+        for axis in axes[:, 0]:
+            axis.set_ylabel("Evaluations")
+        handles = [axes[0, 0].plot([], [], marker="o", **look[name])[0] for name in titles]
+        legend(drawn, handles, list(titles.values()))
+        drawn.suptitle(
+            f"{results['title']}: median evaluations to a gap of {GAP}\n"
+            "Open: the budget, where no more than half of the starts got there",
+            x=0.01,
+            ha="left",
+            fontsize=10,
+        )
+
+
+def _medians(axis, tasks: list[dict[str, Any]], method: str, look: dict[str, dict]) -> None:
+    """Those of a method over the dimensions; open at the budget where there is none."""
+    medians = [able(task)[method]["took"]["gap"][GAP]["evaluations"]["median"] for task in tasks]
+    x = np.array([task["dimensions"] for task in tasks])
+    y = np.array([np.nan if median is None else median for median in medians], float)
+    budgets = np.array([task["budget"]["evaluations"] for task in tasks], float)
+    axis.plot(x, y, marker="o", **look[method])
+    missed = np.where(np.isnan(y), budgets, np.nan)
+    axis.plot(x, missed, marker="o", ls="none", mfc="none", color=look[method]["color"])

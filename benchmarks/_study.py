@@ -1,0 +1,93 @@
+"""A study is a command: it measures, and what it measured is written, drawn and shown.
+
+A module of `studies` has HELP, one line; OPTIONS, the names of the flags that it knows, of those in
+`__main__.FLAGS`; `measure`, (options, folder) -> results, a dict that JSON knows, where `options`
+has these flags; `draw`, (results, folder) -> None; and `tables`, results -> Grids. Pictures and
+tables know nothing but the results, so that they can be made again from the file.
+"""
+
+import json
+import os
+import platform
+from argparse import Namespace
+from collections.abc import Iterable
+from importlib import metadata
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from rich.console import Console
+
+from benchmarks._grid import Grid, to_rich
+
+HERE = Path(__file__).parent
+COMMITTED = HERE / "results"  # what the tables of the README were made from
+RUNS = HERE / "runs"  # what a user runs; git ignores it
+PACKAGES = (
+    *("smoothdiff", "jax", "jaxlib", "optax", "optimistix", "equinox", "lineax", "numpy", "scipy"),
+    *("mitsuba", "coco-experiment", "cma", "evosax", "jaxopt", "Py-BOBYQA", "pygad"),
+)
+
+
+def about(options: Namespace) -> dict[str, Any]:
+    """What stands at the head of all results."""
+    setting = "full" if getattr(options, "full", False) else "quick"
+    return {"command": options.said, "setting": setting, "machine": machine()}
+
+
+def run(study: ModuleType, options: Namespace, folder: Path) -> None:
+    """Measures what has not been measured, writes results.json and pictures, prints tables."""
+    results = write(about(options) | study.measure(options, folder), folder)
+    study.draw(results, folder)
+    show(study.tables(results))
+    Console().print(f"Written to {folder}")
+
+
+def show(grids: Iterable[Grid]) -> None:
+    """Prints tables."""
+    for grid in grids:
+        Console().print(to_rich(grid))
+
+
+def write(results: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Writes results.json, all or nothing, and gives what it says, with texts as keys."""
+    text = json.dumps(rounded(results), separators=(",", ":"), allow_nan=False)
+    folder.mkdir(parents=True, exist_ok=True)
+    temporary = folder / "results.tmp"
+    temporary.write_text(text + "\n")
+    os.replace(temporary, folder / "results.json")
+    return json.loads(text)
+
+
+def rounded(tree: Any, digits: int = 4) -> Any:
+    """Numbers with the digits that they deserve; what is not finite is None."""
+    if isinstance(tree, float):
+        return float(f"{tree:.{digits}g}") if abs(tree) < float("inf") else None
+    if isinstance(tree, dict):
+        return {str(key): rounded(value, digits) for key, value in tree.items()}
+    return [rounded(each, digits) for each in tree] if isinstance(tree, list | tuple) else tree
+
+
+def machine() -> dict[str, Any]:
+    """Where the numbers come from."""
+    versions = {}
+    for package in PACKAGES:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    return {
+        "platform": platform.platform(),
+        "cpu": _cpu(),
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+        "versions": versions,
+    }
+
+
+def _cpu() -> str:
+    try:
+        with open("/proc/cpuinfo") as lines:
+            return next(line.split(":")[1].strip() for line in lines if "model name" in line)
+    except (OSError, StopIteration):
+        return platform.processor()

@@ -1,0 +1,108 @@
+"""The results of a task as tables: what each level took, and what was left at the end."""
+
+from collections.abc import Iterator
+from typing import Any
+
+from benchmarks._grid import Grid, Row, short, spread
+from benchmarks._pictures import GAP, errors_of
+from benchmarks._summary import COSTS, able
+
+CAPTIONS = {
+    "image_error": "On renders without noise, which are not charged.",
+    "parameter_error": "Seconds are without compilation.",
+    "gap": "It is absolute.",
+}
+COMPARED = "99"  # percent: the level at which runs are put beside the committed ones
+
+
+def tables(results: dict[str, Any]) -> Iterator[Grid]:
+    """All tables of a task, or of each task of a family and one of the family."""
+    for task in results["tasks"].values():
+        for error in errors_of(task):
+            yield _took(task, error)
+        yield _left(task)
+    if len(results["tasks"]) > 1:
+        yield _family(results)
+
+
+def _took(task: dict[str, Any], error: str) -> Grid:
+    kind, unit = error.replace("_", " "), "" if error == "gap" else " %"
+    rows = []
+    for found in able(task).values():
+        levels = found["took"][error].items()
+        for i, (level, took) in enumerate(levels):
+            there = f"{took['solved']}/{found['starts']}"
+            cells = (level + unit, there, *(spread(took[cost]) for cost in COSTS))
+            rows.append(Row("" if i else found["title"], cells, end=i == len(levels) - 1))
+    return Grid(
+        title=f"{task['title']}: reducing the {kind}",
+        caption=f"Median [quartiles] over the starts; - is not reached. {CAPTIONS[error]}",
+        columns=("method", "to" if error == "gap" else "reduction", "solved", *COSTS),
+        rows=tuple(rows),
+    )
+
+
+def _left(task: dict[str, Any]) -> Grid:
+    budget = task["budget"]
+    not_able = " ".join(
+        f"{found['title']} is not able here: {found['not_able']}."
+        for found in task["methods"].values()
+        if "not_able" in found
+    )
+    rows = []
+    for found in able(task).values():
+        errors = [found["final"][error] for error in ("image_error", "parameter_error")]
+        shown = (spread(each) for each in (*errors, found["distance"]))
+        rows.append(Row(found["title"], (*shown, f"{found['warm_up_seconds']:.1f} s")))
+    return Grid(
+        title=f"At the end, after {budget['evaluations']} evaluations or {budget['seconds']:g} s",
+        caption=f"Distance in units of the parameters. Compilation is not charged. {not_able}",
+        columns=("method", "image error", "parameter error", "distance", "compile"),
+        rows=tuple(rows),
+    )
+
+
+def _family(results: dict[str, Any]) -> Grid:
+    """Evaluations of each method on each task, where all have a lowest value."""
+    tasks = results["tasks"]
+    titles = {name: found["title"] for task in tasks.values() for name, found in able(task).items()}
+
+    def cell(task: dict[str, Any], method: str) -> str:
+        found = able(task).get(method)
+        if found is None or "gap" not in found["took"]:
+            return ""
+        took = found["took"]["gap"][GAP]
+        return f"{short(took['evaluations']['median'])} ({took['solved']}/{found['starts']})"
+
+    return Grid(
+        title=f"{results['title']}: evaluations to a gap of {GAP}",
+        caption="Median over the starts; how many got there; - is no more than half.",
+        columns=("method", *tasks),
+        rows=tuple(
+            Row(title, tuple(cell(task, method) for task in tasks.values()))
+            for method, title in titles.items()
+        ),
+    )
+
+
+def compare(results: dict[str, Any], committed: dict[str, Any]) -> Iterator[Grid]:
+    """What was run here beside what is in the repository."""
+    for name, task in results["tasks"].items():
+        theirs = able(committed["tasks"].get(name, {"methods": {}}))
+        rows = []
+        for method, found in able(task).items():
+            if method not in theirs:
+                continue
+            cells = []
+            for cost in COSTS:
+                for each in (found, theirs[method]):
+                    took = each["took"]["image_error"][COMPARED]
+                    cells.append(f"{spread(took[cost])} ({took['solved']}/{each['starts']})")
+            rows.append(Row(found["title"], tuple(cells)))
+        yield Grid(
+            title=f"{task['title']}: to {COMPARED} % of the image error, here and committed",
+            caption=f"Committed: {committed['command']}, {committed['machine']['cpu']}. "
+            "Median [quartiles] (how many starts got there).",
+            columns=("method", *(f"{cost}, {who}" for cost in COSTS for who in ("here", "comm."))),
+            rows=tuple(rows),
+        )

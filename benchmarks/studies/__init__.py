@@ -1,0 +1,1 @@
+"""The commands beside `run`: each measures, draws and shows one thing; see `_study`."""

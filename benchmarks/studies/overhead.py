@@ -1,0 +1,98 @@
+"""What derivatives cost beyond the evaluations that they need, on Box10.
+
+A gradient, a Hessian and a Hessian-vector product of N = 256 samples are timed against drawing the
+same points and evaluating the function there, and the ratio is taken turn by turn.
+"""
+
+from argparse import Namespace
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+import smoothdiff as sd
+from benchmarks._grid import Grid
+from benchmarks._style import COLOURS, figure
+from benchmarks._timing import in_turns
+from benchmarks.studies._listed import listed
+from benchmarks.tasks.boxes import BOX10_START, box10_loss
+
+HELP = "derivatives against evaluating at the same points"
+OPTIONS = ()
+SAMPLES = 256
+SIGMA = 0.1
+TURNS = 200
+TARGET = 1.10
+SAMPLER = sd.Gaussian()
+
+
+def evaluating(fun: Callable, sigma: float, sampler: Any, num: int) -> Callable:
+    """(key, y) -> the function at the points that the transforms draw."""
+
+    def evaluate(key: Array, y: Array) -> Array:
+        z, _ = sampler.draw(key, 0, num, num, y.size, y.dtype)
+        return jax.vmap(lambda z: fun(y + sigma * z))(z)
+
+    return evaluate
+
+
+def transforms() -> dict[str, Callable]:
+    """What is timed, each as a function of key and y."""
+    timed = {}
+    for baseline in ("mean", "gp"):
+        options: Any = {"num_samples": SAMPLES, "sampler": SAMPLER, "baseline": baseline}
+        hvp = sd.smooth_hvp(box10_loss, SIGMA, **options)
+        timed[f"smooth_grad, {baseline}"] = sd.smooth_grad(box10_loss, SIGMA, **options)
+        timed[f"smooth_hessian, {baseline}"] = sd.smooth_hessian(box10_loss, SIGMA, **options)
+        timed[f"smooth_hvp, {baseline}"] = lambda key, y, hvp=hvp: hvp(key, y, jnp.ones_like(y))
+    return timed
+
+
+def measure(options: Namespace, folder: Path) -> dict[str, Any]:
+    """Ratios and times of each transform."""
+    y, keys = jnp.asarray(BOX10_START), list(jax.random.split(jax.random.key(0), TURNS + 1))
+    alone = jax.jit(evaluating(box10_loss, SIGMA, SAMPLER, SAMPLES))
+    lines = []
+    for name, transform in transforms().items():
+        derive = jax.jit(transform)
+        calls = {"ours": lambda i, f=derive: f(keys[i], y), "alone": lambda i: alone(keys[i], y)}
+        ours, evaluations = in_turns(calls, TURNS).values()
+        lines.append(
+            {
+                "transform": name,
+                "ratio": np.quantile(ours / evaluations, [0.25, 0.5, 0.75]).tolist(),
+                "ms": 1e3 * np.median(ours).item(),
+                "ms of evaluating": 1e3 * np.median(evaluations).item(),
+            }
+        )
+    return {"samples": SAMPLES, "turns": TURNS, "target": TARGET, "lines": lines}
+
+
+def tables(results: dict[str, Any]) -> Iterator[Grid]:
+    """A line for each transform."""
+    yield listed(
+        f"Box10, {results['samples']} samples: time over evaluating at the same points",
+        f"Median [quartiles] of {results['turns']} turns; target: at most {results['target']:.2f}.",
+        results["lines"],
+    )
+
+
+def draw(results: dict[str, Any], folder: Path) -> None:
+    """Ratios with their quartiles."""
+    target, lines = results["target"], results["lines"]
+    low, middle, high = np.array([line["ratio"] for line in lines]).T
+    places = np.arange(len(lines))
+    with figure(folder / "overhead.png", 1, 1, (5, 3.2)) as (_, axes):
+        axis = axes[0, 0]
+        spread = (middle - low, high - middle)
+        axis.errorbar(middle, places, xerr=spread, fmt="o", color=COLOURS[1], capsize=3)
+        axis.axvline(1, color="0.4", lw=0.8)
+        axis.axvline(target, color=COLOURS[0], lw=0.8, ls="--")
+        axis.text(target, len(lines) - 0.6, f" target {target:.2f}", color=COLOURS[0], fontsize=8)
+        axis.set(yticks=places, yticklabels=[line["transform"] for line in lines])
+        axis.set(xlim=(min(0.9, low.min() - 0.05), max(1.25, high.max() + 0.05)))
+        axis.set(ylim=(len(lines) - 0.4, -0.6), xlabel="Time over evaluating alone")

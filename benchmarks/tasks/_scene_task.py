@@ -1,0 +1,112 @@
+"""The task of finding the parameters of a scene of Mitsuba from a picture of it.
+
+A scene's module says what is in the picture, what is varied, what is sought and where to start. The
+photograph that is to be matched has many samples and other noise than the picture.
+"""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from benchmarks._task import Budget, NativeAD, Problem, Score, Task, TaskEntry
+from benchmarks.scenes._dearer import dearer
+from benchmarks.scenes.mitsuba_scene import VARIANT, Describe, Description, Params, picture
+
+EXACT, PHOTO = 9, 64  # times the samples, for the score and for the photograph
+
+
+def scene_task(
+    full: bool,
+    *,
+    name: str,
+    title: str,
+    scene: Describe,
+    params: Params,
+    reference: ArrayLike,
+    bounds: tuple[ArrayLike, ArrayLike],
+    start_box: tuple[ArrayLike, ArrayLike],
+    sigma: float,
+    budget: Budget,
+    resolution: int = 32,
+    spp: int = 4,
+    variant: str = VARIANT,
+    ad_integrator: Description | None = None,
+    photo: Float[np.ndarray, "height width 3"] | None = None,
+    score: Score | None = None,
+) -> Task:
+    """The task. Its loss is the mean squared difference of the pictures.
+
+    Args:
+        full: 20 starts, not 5.
+        name: The task's name.
+        title: What is sought, in one line.
+        scene: Describes the scene.
+        params: What is varied.
+        reference: The y that is sought.
+        bounds: (low, high), each like y.
+        start_box: (low, high): starts are uniform in between.
+        sigma: The scale of all entries of y.
+        budget: Where a run ends.
+        resolution: Pixels along a side.
+        spp: Samples per pixel, a square.
+        variant: Of Mitsuba.
+        ad_integrator: What Mitsuba differentiates the picture with, or None where it cannot.
+        photo: The photograph, or None for one with 64 times the samples.
+        score: How y is scored, or None for pictures with 9 times the samples.
+    """
+    pictured = partial(picture, scene, params, variant, resolution=resolution)
+    sought, low, high, start_low, start_high = (
+        jnp.asarray(y, jnp.float32) for y in (reference, *bounds, *start_box)
+    )
+    render = pictured(spp=spp)
+    if photo is None:
+        photo = np.asarray(pictured(spp=PHOTO * spp, seed=1)(sought))
+
+    if score is None:
+        image, again = pictured(spp=EXACT * spp), pictured(spp=EXACT * spp, seed=2)
+        exact, exact_again = image(sought), again(sought)
+
+        def exact_loss(y: Array) -> Array:
+            # other noise in each factor: in the mean it vanishes, where squares would add it up
+            product = (image(y) - exact) * (again(y) - exact_again)
+            return jnp.maximum(jnp.mean(product), 0)
+
+        score = Score(sought, exact_loss, image)
+
+    def start(seed: int) -> Float[Array, " n"]:
+        return jax.random.uniform(
+            jax.random.key(seed), sought.shape, minval=start_low, maxval=start_high
+        )
+
+    def native_ad(integrator: Description) -> NativeAD:
+        from benchmarks.scenes import _mitsuba_ad
+
+        return _mitsuba_ad.value_and_grad(scene, params, integrator, photo, spp)
+
+    return Task(
+        name=name,
+        title=title,
+        problem=Problem(
+            bounds=(low, high),
+            sigma=sigma,
+            budget=budget,
+            residuals=lambda y: render(y) - photo,
+            native_ad=partial(native_ad, ad_integrator) if ad_integrator else None,
+        ),
+        score=score,
+        start=start,
+        seeds=20 if full else 5,
+        dearer=lambda: dearer(scene, params, resolution, spp, variant),
+        notes=f"{resolution} x {resolution} pixels, {spp} samples per pixel, {variant}",
+    )
+
+
+def scene_entry(name: str, title: str, **settings: Any) -> dict[str, TaskEntry]:
+    """A module's TASKS with one such task; settings as for `scene_task`."""
+    build = partial(scene_task, name=name, title=title, **settings)
+    return {name: TaskEntry(title, "scene", build)}
