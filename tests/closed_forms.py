@@ -9,6 +9,8 @@ import numpy as np
 from jax.scipy.stats import norm
 
 import smoothdiff as sd
+from smoothdiff._baselines import Control
+from smoothdiff._named_baselines import as_baseline
 
 
 class Case(NamedTuple):
@@ -134,6 +136,35 @@ class Widened(sd.AbstractSampler):
         return wide, log_ratio
 
 
+class Sides(Control):
+    """Several baselines at work side by side."""
+
+    residual: dict
+    sides: dict[str, Control]
+
+    def smoothed(self, shift, ratio):
+        return {name: control.smoothed(shift, ratio) for name, control in self.sides.items()}
+
+
+class Several(sd.AbstractBaseline):
+    """Several baselines on the same samples: the estimate is a dictionary of theirs.
+
+    For `smooth` and `smooth_jacobian`. One program for all costs a third of one for each.
+    """
+
+    baselines: dict[str, sd.AbstractBaseline]
+
+    def __init__(self, *names: str, **baselines: sd.AbstractBaseline):
+        self.baselines = {name: as_baseline(name) for name in names} | baselines
+
+    def evaluations(self):
+        return max(baseline.evaluations() for baseline in self.baselines.values())
+
+    def __call__(self, values, draws, log_ratio, valid, center):
+        made = {n: b(values, draws, log_ratio, valid, center) for n, b in self.baselines.items()}
+        return Sides({n: control.residual for n, control in made.items()}, made)
+
+
 def keys(num: int, seed: int = 0):
     return jax.random.split(jax.random.key(seed), num)
 
@@ -148,6 +179,20 @@ def quadratic_model(fun: Callable, sigma, **options):
     return g
 
 
+def taylor(g: Callable):
+    """Value, Jacobian and Hessian of g, forward over reverse, from one evaluation of g."""
+
+    def first(x):
+        slope, value = jax.jacrev(lambda x: (value := g(x), value), has_aux=True)(x)
+        return slope, (value, slope)
+
+    def at(x):
+        hessian, (value, slope) = jax.jacfwd(first, has_aux=True)(x)
+        return value, slope, hessian
+
+    return at
+
+
 def primitives(fun: Callable, *args) -> list[str]:
     """The names of all primitives in the jaxpr of `fun`, nested ones included."""
     return [eqn.primitive.name for eqn in _equations(jax.make_jaxpr(fun)(*args).jaxpr)]
@@ -159,21 +204,29 @@ def largest(fun: Callable, *args) -> int:
     return max(v.aval.size for eqn in equations for v in eqn.outvars if hasattr(v.aval, "size"))
 
 
+def inner_jaxprs(eqn):
+    """The jaxprs that an equation calls."""
+    for value in eqn.params.values():
+        for sub in value if isinstance(value, tuple | list) else (value,):
+            inner = getattr(sub, "jaxpr", sub)
+            if hasattr(inner, "eqns"):
+                yield inner
+
+
 def _equations(jaxpr):
     for eqn in jaxpr.eqns:
         yield eqn
-        for value in eqn.params.values():
-            for sub in value if isinstance(value, tuple | list) else (value,):
-                inner = getattr(sub, "jaxpr", sub)
-                if hasattr(inner, "eqns"):
-                    yield from _equations(inner)
+        for inner in inner_jaxprs(eqn):
+            yield from _equations(inner)
 
 
-def assert_unbiased(estimates, exact, *, resolution: float, errors: float = 4.5) -> None:
+def assert_unbiased(
+    estimates, exact, *, resolution: float, errors: float = 4.5, name: str = ""
+) -> None:
     """The mean over the leading axis lies within `errors` standard errors of the exact value.
 
     `resolution` bounds those standard errors relative to the largest exact entry of the leaf, so
-    that a test cannot pass because it is blind.
+    that a test cannot pass because it is blind. `name` says which case it is.
     """
     assert jax.tree.structure(estimates) == jax.tree.structure(exact)
     for found, want in zip(jax.tree.leaves(estimates), jax.tree.leaves(exact), strict=True):
@@ -182,13 +235,13 @@ def assert_unbiased(estimates, exact, *, resolution: float, errors: float = 4.5)
         error = found.std(axis=0, ddof=1) / np.sqrt(len(found))
         size = np.max(np.abs(want))
         assert mean.shape == want.shape
-        assert np.max(error) <= resolution * size, f"blind: {error} against {size}"
+        assert np.max(error) <= resolution * size, f"{name} blind: {error} against {size}"
         rounding = 1e-5 * size
         away = np.abs(mean - want) / (error + rounding)
-        assert np.max(away) < errors, f"{mean} against {want}: {away} standard errors"
+        assert np.max(away) < errors, f"{name} {mean} against {want}: {away} standard errors"
 
 
-def assert_same(found, want, dtype: Any = np.float32, scale: float = 1.0) -> None:
+def assert_same(found, want, dtype: Any = np.float32, scale: float = 1.0, name: str = "") -> None:
     """Equal to rounding, relative to the largest entry of each leaf."""
     assert jax.tree.structure(found) == jax.tree.structure(want)
     tolerance = scale * (2e-5 if np.dtype(dtype) == np.float32 else 1e-12)
@@ -196,4 +249,4 @@ def assert_same(found, want, dtype: Any = np.float32, scale: float = 1.0) -> Non
         a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
         assert a.shape == b.shape
         size = max(np.max(np.abs(b), initial=0.0), np.finfo(np.float32).tiny)
-        np.testing.assert_allclose(a / size, b / size, rtol=0, atol=tolerance)
+        np.testing.assert_allclose(a / size, b / size, rtol=0, atol=tolerance, err_msg=name)

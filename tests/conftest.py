@@ -10,8 +10,14 @@ import pytest
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
-# most of a test is compiling, which takes a quarter to a third less without optimisations
-jax.config.update("jax_disable_most_optimizations", True)
+
+
+def pytest_configure(config):
+    """The quick part compiles without optimisations; `pytest -m slow` runs what users run.
+
+    Most of a quick test is compiling, which takes a quarter to a third less without.
+    """
+    jax.config.update("jax_disable_most_optimizations", config.option.markexpr != "slow")
 
 
 @pytest.fixture(autouse=True, scope="module")

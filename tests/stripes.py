@@ -1,52 +1,73 @@
-"""A task of the tests: two stripes whose brightness is sought, and a method that halves the way."""
+"""A task of the tests: two stripes whose brightness is sought; methods; and a registry of these."""
+
+import sys
 
 import jax
 import jax.numpy as jnp
 
-from benchmarks._task import Budget, Task
+from benchmarks import _registry
+from benchmarks._task import Budget, MethodEntry, Problem, Score, Task, TaskEntry
 
 TITLE = "Stripes"
 SIDE = 8  # pixels
+REFERENCE = jnp.asarray([0.25, 0.5])
 
 
-def build(full, spp=4):
+def build(full, **changes):
     """A picture with one stripe of each parameter's brightness."""
-    reference = jnp.asarray([0.25, 0.5])
 
     def image(y):
         return jnp.broadcast_to(jnp.repeat(y, SIDE // 2)[:, None, None], (SIDE, SIDE, 3))
 
     def residuals(y):
-        return image(y) - image(reference)
+        return image(y) - image(REFERENCE)
 
-    def loss(y):
-        return jnp.sum(residuals(y) ** 2)  # exact, however it is compiled
-
-    return Task(
-        name="stripes",
-        title=TITLE,
-        loss=loss,
-        exact_loss=loss,
-        start=lambda seed: jnp.asarray([0.875, 0.125 + 0.0625 * (seed % 4)]),
-        reference=reference,
+    problem = Problem(
+        loss=lambda y: jnp.sum(residuals(y) ** 2),  # exact, however it is compiled
+        residuals=residuals,
         bounds=(jnp.zeros(2), jnp.ones(2)),
         sigma=0.3,
         budget=Budget(evaluations=60, seconds=60),
+    )
+    return Task(
+        name="stripes",
+        title=TITLE,
+        problem=problem,
+        score=Score(REFERENCE, image=image),
+        start=lambda seed: jnp.asarray([0.875, 0.125 + 0.0625 * (seed % 4)]),
         seeds=2,
-        image=image,
-        residuals=residuals,
+        **changes,
     )
 
 
-def halving(task):
+def halving(problem):
     """Halves the distance at each iteration, for one evaluation."""
-    loss = jax.jit(task.loss)
+    loss = jax.jit(problem.loss)
 
     def solve(y0, key, record):
         y = y0
         for _ in range(8):
-            y = (y + task.reference) / 2
+            y = (y + REFERENCE) / 2
             loss(y).block_until_ready()
             record(y)
 
     return solve
+
+
+def failing(problem):
+    raise RuntimeError("no luck\nat all")
+
+
+def registered(monkeypatch, tasks=None, methods=None):
+    """Makes a registry of some tasks, name -> build, and of some methods, name -> prepare."""
+    tasks = {"stripes": build} if tasks is None else tasks
+    entries = {name: TaskEntry(name.title(), "scene", build) for name, build in tasks.items()}
+    methods = {"halving": halving, "failing": failing} if methods is None else methods
+    here = sys.modules[__name__]
+    found = {
+        name: (here, MethodEntry(name.title(), ("scene",), prepare))
+        for name, prepare in methods.items()
+    }
+    monkeypatch.setattr(_registry, "tasks", lambda: entries)
+    monkeypatch.setattr(_registry, "_entries", lambda: found)
+    monkeypatch.setenv("COLUMNS", "200")

@@ -12,9 +12,11 @@ from closed_forms import (
     Widened,
     assert_same,
     boxes,
+    inner_jaxprs,
     keys,
     largest,
     primitives,
+    taylor,
 )
 
 import smoothdiff as sd
@@ -39,6 +41,23 @@ class Counted:
         before = self.count
         jax.block_until_ready(call())
         return self.count - before
+
+
+def evaluations(fun, *args):
+    """At how many points a call of `fun` evaluates the black box, without compiling it."""
+    return _evaluations(jax.make_jaxpr(fun)(*args).jaxpr)
+
+
+def _evaluations(jaxpr):
+    total = 0
+    for eqn in jaxpr.eqns:
+        if eqn.primitive.name == "pure_callback":
+            total += math.prod(eqn.invars[0].aval.shape[:-1])
+        inner = sum(map(_evaluations, inner_jaxprs(eqn)))
+        # how often a while loop runs is not known: what is in one must not be the black box
+        assert not (inner and eqn.primitive.name == "while")
+        total += inner * eqn.params.get("length", 1)
+    return total
 
 
 # ---------------------------------------------------------------------------------------------
@@ -66,127 +85,162 @@ COUNTED = {
 # every transform as it is, and the most involved one with every option
 PAIRINGS = [(name, options) for name in TRANSFORMS for options in ("mean", "stderr, chunks")]
 PAIRINGS += [("hvp", options) for options in COUNTED if ("hvp", options) not in PAIRINGS]
+X = jnp.array([0.1, 0.2])
+
+
+def counted(name, with_options):
+    f, options = Counted(), {**PLAIN, "num_samples": 24, **COUNTED[with_options]}
+    return f, TRANSFORMS[name](f, 0.5, **options), options["num_samples"]
 
 
 @pytest.mark.parametrize(("name", "with_options"), PAIRINGS)
 def test_a_call_evaluates_exactly_num_samples_times(name, with_options, key):
-    f, options = Counted(), {**PLAIN, "num_samples": 24, **COUNTED[with_options]}
-    g = jax.jit(TRANSFORMS[name](f, 0.5, **options))
-    x = jnp.array([0.1, 0.2])
-    assert f.during(lambda: g(key, x)) == options["num_samples"]
-    assert f.during(lambda: g(key, x)) == options["num_samples"]  # compiling took none
+    _, g, num_samples = counted(name, with_options)
+    assert evaluations(g, key, X) == num_samples
+
+
+@pytest.mark.parametrize(
+    ("name", "with_options"), [("smooth", "mean"), ("hvp", "chunks, center"), ("grad", "stderr")]
+)
+def test_evaluations_are_counted_where_they_happen(name, with_options, key):
+    """What the program says, above, is what it does."""
+    f, g, num_samples = counted(name, with_options)
+    run = jax.jit(g)
+    assert f.during(lambda: run(key, X)) == num_samples
+    assert f.during(lambda: run(key, X)) == num_samples  # compiling took none
 
 
 @pytest.mark.parametrize("batch_size", [None, 10])
 def test_nested_ad_takes_no_further_evaluations(batch_size, key):
     f = Counted()
     g = sd.smooth(f, 0.5, **PLAIN, num_samples=24, batch_size=batch_size)
-    x = jnp.array([0.1, 0.2])
     along = lambda x: jax.jvp(lambda x: jax.grad(g, 1)(key, x), (x,), (x,))[1]
-    in_sigma = lambda s: sd.smooth(f, s, **PLAIN, num_samples=24, batch_size=batch_size)(key, x)
+    in_sigma = lambda s: sd.smooth(f, s, **PLAIN, num_samples=24, batch_size=batch_size)(key, X)
 
     def linearized(x):
         _, apply = jax.linearize(lambda x: jax.grad(g, 1)(key, x), x)
         return jax.lax.map(apply, jnp.ones((10, 2)))
 
-    for derived, at in (
-        (lambda x: jax.hessian(g, 1)(key, x), x),
-        (lambda x: jax.jacfwd(jax.hessian(g, 1), 1)(key, x), x),
-        (along, x),
-        (linearized, x),
-        (jax.hessian(in_sigma), jnp.array([0.5, 0.4])),
-    ):
-        run = jax.jit(derived)
-        assert f.during(lambda run=run, at=at: run(at)) == 24
+    derivatives = {
+        "hessian": (lambda x: jax.hessian(g, 1)(key, x), X),
+        "third": (lambda x: jax.jacfwd(jax.hessian(g, 1), 1)(key, x), X),
+        "along": (along, X),
+        "linearized": (linearized, X),
+        "in sigma": (jax.hessian(in_sigma), jnp.array([0.5, 0.4])),
+    }
+    assert {n: evaluations(*fun_and_at) for n, fun_and_at in derivatives.items()} == dict.fromkeys(
+        derivatives, 24
+    )
 
 
 @pytest.mark.parametrize("batch_size", [None, 10])
 def test_a_quadratic_model_evaluates_once_and_for_all(batch_size, key):
     f = Counted()
-    make = jax.jit(sd.smooth_quadratic(f, 0.5, **PLAIN, num_samples=24, batch_size=batch_size))
-    x = jnp.array([0.1, 0.2])
-    assert f.during(lambda: make(key, x)) == 24
-    model = make(key, x)
-    apply = jax.jit(lambda model, v: model.hessian.mv(v))
+    make = sd.smooth_quadratic(f, 0.5, **PLAIN, num_samples=24, batch_size=batch_size)
 
-    def many():
-        v = x
-        for _ in range(100):
-            v = apply(model, v)
-        return v, jax.jit(lambda m: (m.stderr, m.hessian_stderr(x), m(x)))(model)
-
-    assert f.during(many) == 0
-
-    @jax.jit
-    def together(x):
-        model = make(key, x)
+    def use(model):
         power = jax.lax.fori_loop(0, 100, lambda _, v: model.hessian.mv(v), model.grad)
-        return model.value, power, model.stderr, model.hessian_stderr(x), model(x)
+        return model.value, power, model.stderr, model.hessian_stderr(X), model(X)
 
-    assert f.during(lambda: together(x)) == 24
+    assert evaluations(make, key, X) == 24
+    assert evaluations(use, jax.eval_shape(make, key, X)) == 0
+    assert evaluations(lambda x: use(make(key, x)), X) == 24
+    if batch_size is None:
+        run = jax.jit(lambda x: use(make(key, x)))
+        assert f.during(lambda: run(X)) == 24
 
 
 def test_vmap_over_keys_evaluates_for_each(key):
     f = Counted()
     g = jax.jit(jax.vmap(sd.smooth_grad(f, 0.5, **PLAIN, num_samples=24), in_axes=(0, None)))
     assert f.during(lambda: g(keys(3), jnp.zeros(2))) == 72
+    assert evaluations(g, keys(3), jnp.zeros(2)) == 72
 
 
 # ---------------------------------------------------------------------------------------------
 # chunks
 
-
-SIZES = [
-    (sd.Gaussian(), 1),
-    (sd.Gaussian(), 24),
-    (sd.Gaussian(antithetic=True), 1),
-    (sd.Gaussian(antithetic=True), 7),
-    (sd.Gaussian(antithetic=True), 16),
-    (Widened(), 10),
-]
-
-
-@pytest.mark.parametrize(("sampler", "batch_size"), SIZES)
-def test_chunks_change_only_the_rounding(sampler, batch_size, key):
-    x, v = jnp.array([0.1, 0.2]), jnp.array([1.0, -3.0])
-    fun = lambda x: (boxes(x), x)
-
-    def run(batch_size):
-        options: dict[str, Any] = {
-            **PLAIN,
-            "num_samples": 24,
-            "sampler": sampler,
-            "batch_size": batch_size,
-        }
-        return (
-            sd.smooth_grad(fun, 0.4, **options, has_aux=True)(key, x),
-            jax.grad(lambda s: sd.smooth(boxes, s, **options)(key, x))(jnp.array(0.4)),
-            sd.smooth_value_and_grad(boxes, 0.4, **options, stderr=True)(key, x),
-            sd.smooth_hvp(boxes, 0.4, **options, stderr=True)(key, x, v),
-        )
-
-    found, want = jax.jit(lambda: (run(batch_size), run(None)))()
-    assert_same(found, want)
+PAIRS = sd.Gaussian(antithetic=True)
+# sampler, num_samples, batch_size
+SIZES: dict[str, tuple[sd.AbstractSampler, int, int]] = {
+    "less than a pair": (PAIRS, 24, 1),
+    "pairs with a rest": (PAIRS, 26, 7),
+    "weighted": (Widened(), 24, 10),
+    "parts of replicates": (sd.Sobol(replicates=4), 24, 10),
+    "one": (sd.Gaussian(), 24, 1),
+    "all": (sd.Gaussian(), 24, 24),
+    "pairs": (PAIRS, 24, 16),
+}
 
 
-def test_memory_falls_by_the_ratio_of_the_chunks(key):
+def sizes(*quick):
+    return [
+        pytest.param(*case, marks=[] if name in quick else pytest.mark.slow, id=name)
+        for name, case in SIZES.items()
+    ]
+
+
+def with_and_without_chunks(make, sampler, num_samples, batch_size):
+    """What `make(options)` returns with a batch_size, and without."""
+    options: dict[str, Any] = {**PLAIN, "num_samples": num_samples, "sampler": sampler}
+    run = lambda batch_size: make({**options, "batch_size": batch_size})
+    return jax.jit(lambda: (run(batch_size), run(None)))()
+
+
+@pytest.mark.parametrize(
+    ("sampler", "num_samples", "batch_size"),
+    sizes("less than a pair", "pairs with a rest", "weighted"),
+)
+def test_chunks_change_only_the_rounding(sampler, num_samples, batch_size, key):
+    """Of the value, of first and second derivatives in parameters and sigma, of aux."""
+
+    def run(options):
+        def g(at):
+            out, aux = sd.smooth(lambda x: (boxes(x), x), at[2], **options, has_aux=True)(
+                key, at[:2]
+            )
+            return {"out": out, "aux": jax.lax.stop_gradient(aux)}
+
+        return taylor(g)(jnp.array([0.1, 0.2, 0.4]))
+
+    assert_same(*with_and_without_chunks(run, sampler, num_samples, batch_size))
+
+
+@pytest.mark.parametrize(
+    ("sampler", "num_samples", "batch_size"), sizes("weighted", "parts of replicates")
+)
+def test_chunks_change_only_the_rounding_of_errors(sampler, num_samples, batch_size, key):
+    def run(options):
+        model = sd.smooth_quadratic(boxes, 0.4, **options)(key, X)
+        return model.value, model.grad, model.stderr, model.hessian_stderr(jnp.array([1.0, -3.0]))
+
+    assert_same(*with_and_without_chunks(run, sampler, num_samples, batch_size))
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda fun, **options: sd.smooth_grad(fun, 0.1, **options),
+        pytest.param(
+            lambda fun, **options: jax.grad(sd.smooth(fun, 0.1, **options), argnums=1),
+            marks=pytest.mark.slow,
+        ),
+        lambda fun, **options: lambda key, x: sd.smooth_hvp(fun, 0.1, **options)(key, x, x),
+    ],
+    ids=["grad", "ad", "hvp"],
+)
+def test_memory_falls_by_the_ratio_of_the_chunks(make, key):
     """Compiled only: unchunked, the points alone are 410 MB."""
     x = jax.ShapeDtypeStruct((100_000,), jnp.float32)
-    fun = lambda x: jnp.sum(jnp.round(x))
 
-    def temporary(make, batch_size):
+    def temporary(batch_size):
         options: dict[str, Any] = {**PLAIN, "num_samples": 1024, "batch_size": batch_size}
-        analysis = jax.jit(make(options)).lower(key, x).compile().memory_analysis()
+        g = jax.jit(make(lambda x: jnp.sum(jnp.round(x)), **options))
+        analysis = g.lower(key, x).compile().memory_analysis()
         assert analysis is not None
         return analysis.temp_size_in_bytes
 
-    for make in (
-        lambda options: sd.smooth_grad(fun, 0.1, **options),
-        lambda options: jax.grad(sd.smooth(fun, 0.1, **options), argnums=1),
-        lambda options: lambda key, x: sd.smooth_hvp(fun, 0.1, **options)(key, x, x),
-    ):
-        ratio = temporary(make, None) / temporary(make, 64)
-        assert ratio > 0.8 * 1024 / 64
+    assert temporary(None) / temporary(64) > 0.8 * 1024 / 64
 
 
 # ---------------------------------------------------------------------------------------------

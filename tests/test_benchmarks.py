@@ -1,59 +1,63 @@
-"""The harness of the benchmarks: it counts, stops, scores, keeps and resumes; on a tiny task.
-
-This module is itself the task and one of the methods that the command line is given.
-"""
+"""The loop, the registry and the command line of the benchmarks, on tiny tasks."""
 
 import dataclasses
 import json
 import math
-import types
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from stripes import REFERENCE, build, halving, registered
 
-import smoothdiff as sd
 from benchmarks import __main__ as cli
-from benchmarks import _harness, methods, overhead, tasks
-from benchmarks._summary import cost_to_level
-from benchmarks._task import Budget, Method, NotAble, Task
-from benchmarks.tasks.boxes import BOX10_START
-
-TITLE = "A bowl"
-HIGH = jnp.asarray(2.0)
+from benchmarks import _loop, _registry, _study
+from benchmarks._kept import kept
+from benchmarks._summary import cost_to_level, quartiles
+from benchmarks._task import Budget, Method, NotAble, Problem, Score, Task
+from benchmarks._timing import in_turns
 
 
-def build(full):
-    def loss(y):
-        return y["a"] ** 2 + jnp.sum(y["b"] ** 2)
+def bowl_loss(y):
+    return y["a"] ** 2 + jnp.sum(y["b"] ** 2)
 
-    def start(seed):
-        y = jax.random.uniform(jax.random.key(seed), (3,), minval=0.5, maxval=1.0)
-        return {"a": y[0], "b": y[1:]}
 
-    return Task(
-        name="bowl",
-        title=TITLE,
-        loss=loss,
-        exact_loss=loss,
-        start=start,
-        reference={"a": jnp.zeros(()), "b": jnp.zeros(2)},
-        bounds=({"a": -HIGH, "b": -HIGH}, {"a": HIGH, "b": HIGH}),
+def bowl_start(seed):
+    y = jax.random.uniform(jax.random.key(seed), (3,), minval=0.5, maxval=1.0)
+    return {"a": y[0], "b": y[1:]}
+
+
+def like(value, dtype=np.float32):
+    return {"a": np.full((), value, dtype), "b": np.full(2, value, dtype)}
+
+
+BOWL = Task(
+    name="bowl",
+    title="A bowl",
+    problem=Problem(
+        loss=bowl_loss,
+        bounds=(like(-2), like(2)),
         sigma=0.5,
-        budget=Budget(evaluations=400 if full else 200, seconds=60),
-        seeds=2,
-        image=lambda y: jnp.full((2, 2, 3), y["a"]),
-    )
+        budget=Budget(evaluations=200, seconds=60),
+    ),
+    score=Score(like(0)),
+    start=bowl_start,
+    seeds=2,
+)
 
 
-def prepare(task):
+def prepare(problem):
     """Halves y at each iteration, for five evaluations."""
 
     @jax.jit
     def halve(y):
-        many = jax.vmap(lambda s: task.loss(jax.tree.map(lambda leaf: s * leaf, y)))
-        used = many(jnp.arange(5.0)) * 0
+        many = jax.vmap(lambda s: problem.loss(jax.tree.map(lambda leaf: s * leaf, y)))
+        used = many(jnp.arange(5, dtype=y["a"].dtype)) * 0
         return jax.tree.map(lambda leaf: 0.5 * leaf + used.sum(), y)
 
     def solve(y0, key, record):
@@ -68,242 +72,289 @@ def prepare(task):
 HALVING = Method("halving", "Halving", prepare, "1")
 
 
-@pytest.fixture(autouse=True)
-def standard_promotion():
-    """optax's own Adam does not run under strict promotion."""
-    with jax.numpy_dtype_promotion("standard"):
-        yield
+def changed(task, score=None, **problem):
+    return dataclasses.replace(
+        task, problem=dataclasses.replace(task.problem, **problem), score=score or task.score
+    )
 
 
-@pytest.fixture
-def bowl():
-    return build(full=False)
+def runs_of(task, method, folder, fresh=False):
+    found = _loop.run(task, [method], range(2), folder, fresh=fresh, progress=False)[method]
+    assert isinstance(found, list), found
+    return found
 
 
-def harness(task, method, folder, fresh=False) -> list[_harness.Run]:
-    found = _harness.run(task, [method], 2, folder, setting="quick", fresh=fresh, progress=False)
-    runs = found[method]
-    assert isinstance(runs, list), runs
-    return runs
-
-
-def test_counts_every_evaluation_under_jit_vmap_and_scan(bowl):
-    counter = _harness.Counter()
-    loss = counter.watch(bowl.loss)
-    y = bowl.start(0)
-    assert jax.jit(loss)(y) == bowl.loss(y)
+def test_counts_every_evaluation_under_jit_vmap_and_scan():
+    counter = _loop.Counter()
+    seen = counter.watched(changed(BOWL, residuals=lambda y: y["b"]).problem)
+    y = bowl_start(0)
+    assert jax.jit(seen.loss)(y) == bowl_loss(y)
     assert counter.evaluations == 1
     many = jax.tree.map(lambda leaf: jnp.stack([leaf] * 7), y)
-    jax.jit(jax.vmap(loss))(many).block_until_ready()
-    assert counter.evaluations == 8
-    jax.block_until_ready(jax.lax.scan(lambda total, y: (total + loss(y), None), 0.0, many))
+    jax.jit(jax.vmap(seen.residuals))(many).block_until_ready()
+    assert counter.evaluations == 8  # once for each y, whatever the size of the value
+    jax.block_until_ready(jax.lax.scan(lambda total, y: (total + seen.loss(y), None), 0.0, many))
     assert counter.evaluations == 15
 
 
-def test_residuals_are_counted_once_for_each_y(bowl):
-    task = dataclasses.replace(bowl, residuals=lambda y: y["b"])
-    counter = _harness.Counter()
-    residuals = _harness._watched(task, counter).residuals
-    assert residuals is not None
-    y = bowl.start(0)
-    assert np.array_equal(jax.jit(residuals)(y), y["b"])
-    assert counter.evaluations == 1
-    many = jax.tree.map(lambda leaf: jnp.stack([leaf] * 7), y)
-    jax.jit(jax.vmap(residuals))(many).block_until_ready()
-    assert counter.evaluations == 8
+def test_the_loss_follows_from_the_residuals():
+    problem = changed(BOWL, loss=None, residuals=lambda y: y["b"]).problem
+    assert problem.loss({"b": jnp.asarray([1.0, 3.0])}) == 5
 
 
-def test_a_known_optimum_is_scored_by_the_gap_in_the_precision_of_the_task(tmp_path):
-    seeds = []
-    with jax.enable_x64(True):
-        bowl = build(full=False)
-
-    def loss(y):
-        assert y["a"].dtype == "float64"
-        return bowl.loss(y) - 3
-
-    def choose(seed):
-        seeds.append(seed)
-        return jax.tree.map(lambda leaf: leaf + seed, bowl.reference)
-
-    task = dataclasses.replace(
-        bowl, loss=loss, exact_loss=loss, precision="float64", optimum=-3.0, choose=choose
-    )
-    first, second = harness(task, HALVING, tmp_path)
-    for run in (first, second):
-        assert run["gap"] == pytest.approx([run["gap"][0] * 0.25**i for i in range(11)])
-        assert run["image_error"] == pytest.approx([0.25**i for i in range(11)])
-    assert first["distance"] < 0.01
-    assert second["distance"] == pytest.approx(3**0.5, rel=0.01)
-    assert seeds == [0, _harness.WARM_UP_SEED, 0, 0, 1, 1]
-    assert jnp.zeros(()).dtype == "float32"
-
-
-def test_traces_are_relative_to_the_start_and_counted(bowl, tmp_path):
-    for seed, run in enumerate(harness(bowl, HALVING, tmp_path)):
-        assert run["seed"] == seed
-        assert run["evaluations"] == list(range(0, 55, 5))
+def test_traces_are_relative_to_the_start_counted_and_kept(tmp_path):
+    first = runs_of(BOWL, HALVING, tmp_path)
+    for seed, run in enumerate(first):
+        assert (run["seed"], run["ended"]) == (seed, "by the method")
+        assert run["evaluations"].tolist() == list(range(0, 55, 5))
         assert run["parameter_error"] == pytest.approx([0.5**i for i in range(11)])
         assert run["image_error"] == pytest.approx([0.25**i for i in range(11)])
-        assert run["ended"] == "by the method"
-        assert run["seconds"] == sorted(run["seconds"])
+        assert np.all(np.diff(run["seconds"]) > 0)
+    again = runs_of(BOWL, HALVING, tmp_path)
+    assert np.array_equal(again[0]["seconds"], first[0]["seconds"])
+    fresh = runs_of(BOWL, HALVING, tmp_path, fresh=True)
+    assert not np.array_equal(fresh[0]["seconds"], first[0]["seconds"])
+    changed_source = HALVING._replace(source="2")
+    other = runs_of(BOWL, changed_source, tmp_path)
+    assert not np.array_equal(other[0]["seconds"], fresh[0]["seconds"])
+    (tmp_path / "halving-1-quick.npz").unlink()  # as after an interruption
+    resumed = runs_of(BOWL, changed_source, tmp_path)
+    assert np.array_equal(resumed[0]["seconds"], other[0]["seconds"])
+    assert np.array_equal(resumed[1]["evaluations"], other[1]["evaluations"])
 
 
-def test_the_budget_ends_a_run(bowl, tmp_path):
-    short = dataclasses.replace(bowl, budget=Budget(evaluations=12, seconds=60))
-    for run in harness(short, HALVING, tmp_path):
-        assert run["evaluations"] == [0, 5, 10, 15]
+def test_a_run_ends_with_its_budget_or_at_the_optimum(tmp_path):
+    for run in runs_of(changed(BOWL, budget=Budget(12, 60)), HALVING, tmp_path):
+        assert run["evaluations"].tolist() == [0, 5, 10, 15]
         assert run["ended"] == "by the budget"
-
-
-def test_a_run_ends_at_the_optimum(bowl, tmp_path):
-    lowest = float(bowl.loss(bowl.reference))
-    scaled = lambda y: 1e-6 * (bowl.loss(y) - lowest)
-    task = dataclasses.replace(bowl, loss=scaled, exact_loss=scaled, optimum=0.0)
-    for run in harness(task, HALVING, tmp_path):
+    score = dataclasses.replace(BOWL.score, optimum=0.0)
+    small = changed(BOWL, score, loss=lambda y: 1e-6 * bowl_loss(y))
+    for run in runs_of(small, HALVING, tmp_path):
         assert run["gap"][-1] <= 1e-8 < run["gap"][-2]
         assert run["ended"] == "at the optimum"
         assert run["evaluations"][-1] == 5 * (len(run["gap"]) - 1) < 50
 
 
-def test_long_traces_are_thinned_and_keep_their_end(bowl):
-    counter = _harness.Counter()
-    recorder = _harness.Recorder(counter, Budget(10**6, 60), bowl.start(0))
+def test_a_known_optimum_is_scored_by_the_gap_in_the_precision_of_the_task(tmp_path):
+    seeds = []
+
+    def loss(y):
+        assert y["a"].dtype == "float64"
+        return bowl_loss(y) - 3
+
+    def choose(seed):
+        seeds.append(seed)
+        return like(seed, float)
+
+    task = dataclasses.replace(
+        changed(
+            BOWL,
+            Score(like(0, float), optimum=-3.0),
+            loss=loss,
+            bounds=(like(-2, float), like(2, float)),
+        ),
+        precision="float64",
+        choose=choose,
+        start=lambda seed: jax.tree.map(lambda leaf: leaf.astype(float), bowl_start(seed)),
+    )
+    first, second = runs_of(task, HALVING, tmp_path)
+    for run in (first, second):
+        assert run["gap"] == pytest.approx([run["gap"][0] * 0.25**i for i in range(11)])
+    assert first["distance"] < 0.01
+    assert second["distance"] == pytest.approx(3**0.5, rel=0.01)
+    assert seeds == [0, _loop.WARM_UP_SEED, 0, 0, 1, 1]
+    assert jnp.zeros(()).dtype == "float32"
+
+
+def test_errors_of_a_tasks_own_and_iterations_that_a_method_counts(tmp_path):
+    def descend(problem):
+        def solve(y0, key, record):
+            for i in (1, 3, 10):
+                record({"a": y0["a"] * 0 + i, "b": y0["b"]}, i)
+
+        return solve
+
+    score = Score(errors=lambda y, scene: {"height": y["a"], "lost": jnp.sqrt(-y["a"])})
+    task = changed(BOWL, score)
+    method = Method("descend", "", descend, "1")
+    found = _loop.run(task, [method], [0], tmp_path, progress=False, keep=(3,))[method]
+    assert isinstance(found, list)
+    (run,) = found
+    assert run["evaluations"].tolist() == [0, 1, 3, 10]
+    assert run["height"].tolist()[1:] == [1, 3, 10]
+    assert np.all(np.isinf(run["lost"]))
+    assert run["found 3"][0] == 3
+
+
+def test_long_traces_are_thinned_and_keep_their_end():
+    counter = _loop.Counter()
+    recorder = _loop.Recorder(
+        counter, changed(BOWL, budget=Budget(10**6, 60)).problem, bowl_start(0)
+    )
     for counter.evaluations in range(1, 5001):
-        recorder(bowl.reference)
+        recorder(BOWL.score.reference)
     trace = recorder.finish()
     assert len(trace) < 80
     assert trace[-1][0] == 5000
 
 
-def test_finished_runs_are_kept_until_something_changes(bowl, tmp_path):
-    first = harness(bowl, HALVING, tmp_path)
-    assert harness(bowl, HALVING, tmp_path) == first
-    assert harness(bowl, HALVING, tmp_path, fresh=True) != first  # seconds differ
-    again = harness(bowl, HALVING, tmp_path)
-    assert harness(bowl, HALVING._replace(source="2"), tmp_path) != again
-
-    (tmp_path / "halving-1-quick.json").unlink()  # as after an interruption
-    resumed = harness(bowl, HALVING._replace(source="2"), tmp_path)
-    assert [run["evaluations"] for run in resumed] == [run["evaluations"] for run in again]
-
-
-def test_a_method_that_is_not_able_is_named_not_raised(bowl, tmp_path):
-    native = methods.load("mitsuba_ad")
-    found = _harness.run(bowl, [native], 2, tmp_path, setting="quick")[native]
-    assert isinstance(found, NotAble)
-    assert "no derivative" in str(found)
-
-
-def test_a_gradient_of_the_renderer_costs_two(bowl, tmp_path):
-    task = dataclasses.replace(bowl, native_ad=lambda: jax.value_and_grad(bowl.loss))
-    (run, _) = harness(task, methods.load("mitsuba_ad"), tmp_path)
-    assert run["evaluations"][1] == 2
-    assert run["image_error"][-1] < 1e-2
-
-
-@pytest.mark.parametrize(
-    ("name", "per_step"), [("finite_differences", 6), ("fr22", 2), ("cma_es", 7)]
-)
-def test_methods_descend_and_are_charged_what_they_use(name, per_step, bowl, tmp_path):
-    for run in harness(bowl, methods.load(name), tmp_path):
-        assert run["evaluations"][1] == per_step
-        assert run["evaluations"][-1] >= 200
-        assert run["image_error"][-1] < 0.1
-
-
-def test_an_interruption_ends_the_benchmark_and_not_only_the_run(bowl):
-    def record(y):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        methods.load("fr22").prepare(bowl)(bowl.start(0), jax.random.key(0), record)
+def test_what_is_kept_is_whole_or_not_there(tmp_path):
+    path = tmp_path / "a.npz"
+    made = kept(path, "1", lambda: {"x": np.arange(3), "said": {"a": [1, None]}})
+    found = kept(path, "1", lambda: {})
+    assert found["said"] == made["said"]
+    assert np.array_equal(found["x"], made["x"])
+    assert kept(path, "2", lambda: {"other": 1}) == {"other": 1}
+    with pytest.raises(TypeError):
+        kept(path, "3", lambda: {"x": object()})
+    assert kept(path, "2", lambda: {}) == {"other": 1}
 
 
 def test_levels_not_reached_cost_infinity():
     assert cost_to_level([1, 0.2, 0.05, 0.3], [0, 5, 9, 12], 0.1) == 9
     assert cost_to_level([1, 0.2], [0, 5], 0.1) == math.inf
+    assert quartiles([1, math.inf]) == {"median": None, "lower": None, "upper": None}
 
 
-def test_the_command_line_writes_results_pictures_and_table(monkeypatch, tmp_path, capsys):
-    monkeypatch.setitem(tasks.TASKS, "bowl", __name__)
-    monkeypatch.setitem(methods.METHODS, "halving", __name__)
-    monkeypatch.setenv("COLUMNS", "150")
-    cli.main(["run", "bowl", "--methods", "halving,mitsuba_ad", "--full"], tmp_path)
+def test_calls_are_timed_in_turns():
+    seen = []
+    calls = {name: lambda turn, name=name: seen.append((turn, name)) for name in "ab"}
+    seconds = in_turns(calls, 2)
+    assert {name: len(each) for name, each in seconds.items()} == {"a": 2, "b": 2}
+    assert seen == [(0, "a"), (0, "b"), (1, "b"), (1, "a"), (2, "a"), (2, "b")]
+
+
+def test_the_registry_finds_what_the_readme_names(capsys):
+    assert {"shadow", "brdf", "cnn5"} <= set(_registry.scenes())
+    assert {"variance", "overhead", "report"} <= set(_registry.studies())
+    cli.main(["list"])
     printed = capsys.readouterr().out
-    assert "not able here" in printed
+    assert all(name in printed for name in (*_registry.tasks(), *_registry.methods()))
+    with pytest.raises(SystemExit):
+        cli.main(["run", "no-such-task"])
+    with pytest.raises(ValueError, match="no method 'x'"):
+        _registry.method("x")
 
-    folder = tmp_path / "bowl"
-    results = json.loads((folder / "results.json").read_text())
+
+def test_another_text_of_a_module_that_a_method_imports_makes_its_runs_stale():
+    source = _registry.method("gauss_newton").source
+    assert "def run_by" in source
+
+
+def test_every_task_has_methods_that_run_unasked():
+    for name, entry in _registry.tasks().items():
+        assert entry.kind == "descent" or "gauss_newton" in "".join(
+            _registry.methods(entry.kind)
+        ), name
+
+
+def test_the_command_line_writes_results_pictures_and_tables(monkeypatch, tmp_path, capsys):
+    registered(monkeypatch)
+    monkeypatch.setattr(_study, "COMMITTED", tmp_path / "committed")
+    cli.main(["run", "stripes", "--methods", "halving"], tmp_path / "committed")
+    capsys.readouterr()
+
+    def lacking(problem):
+        raise NotAble("it lacks light")
+
+    registered(monkeypatch, methods={"halving": halving, "lacking": lacking})
+    cli.main(["run", "stripes", "--full", "--compare"], tmp_path)
+    printed = capsys.readouterr().out
+    assert "Lacking is not able here: it lacks light." in printed
+    assert "here and committed" in printed
+    results = json.loads((tmp_path / "stripes" / "results.json").read_text())
     assert results["setting"] == "full"
-    assert results["command"].startswith("python -m benchmarks run bowl")
-    assert "not_able" in results["methods"]["mitsuba_ad"]
-    levels = results["methods"]["halving"]
-    assert levels["parameter_error"]["levels"]["99"]["evaluations"] == {
-        "median": 35,
-        "lower": 35,
-        "upper": 35,
-    }
-    assert levels["parameter_error"]["levels"]["99"]["solved"] == 2
-    for picture in ("error-vs-time.png", "error-vs-evaluations.png", "images.png"):
-        assert (folder / picture).read_bytes().startswith(b"\x89PNG")
+    assert results["command"].startswith("python -m benchmarks run stripes")
+    found = results["tasks"]["stripes"]["methods"]
+    assert "not_able" in found["lacking"]
+    took = found["halving"]["took"]["parameter_error"]["99"]
+    assert took["evaluations"] == {"median": 7, "lower": 7, "upper": 7}
+    assert took["solved"] == 2
+    pictures = ("error-vs-time.png", "error-vs-evaluations.png", "images.png")
+    for picture in pictures:
+        assert (tmp_path / "stripes" / picture).read_bytes().startswith(b"\x89PNG")
+    cli.main(["draw", "stripes"], tmp_path / "again")  # from the numbers alone
+    assert all((tmp_path / "again" / "stripes" / picture).exists() for picture in pictures)
+    with pytest.raises(SystemExit, match="no committed results"):
+        cli.main(["draw", "shadow"], tmp_path)
 
 
 def test_a_family_shares_a_table_and_a_picture(monkeypatch, tmp_path, capsys):
     def members(full):
-        return [dataclasses.replace(build(full), name=f"bowl-{n}d", optimum=0.0) for n in (2, 5)]
+        score = Score(REFERENCE, optimum=0.0)
+        tasks = [dataclasses.replace(build(full), score=score, name=f"bowl-{n}d") for n in (2, 5)]
+        return tasks
 
-    family = types.SimpleNamespace(TITLE="Bowls", build=members)
-    monkeypatch.setattr(tasks, "module", lambda name: family)
-    monkeypatch.setitem(tasks.TASKS, "bowls", "")
-    monkeypatch.setitem(methods.METHODS, "halving", __name__)
-    monkeypatch.setenv("COLUMNS", "150")
-    cli.main(["run", "bowls", "--methods", "halving,mitsuba_ad"], tmp_path)
+    registered(monkeypatch, {"bowls": members}, {"halving": halving})
+    cli.main(["run", "bowls"], tmp_path)
     printed = capsys.readouterr().out
     assert "bowl-5d" in printed
     assert "- (0/2)" in printed  # to 1e-8
-
     results = json.loads((tmp_path / "bowls" / "results.json").read_text())
-    found = results["tasks"]["bowl-2d"]["methods"]
-    assert "not_able" in found["mitsuba_ad"]
-    assert "runs" not in found["halving"]
-    assert found["halving"]["gap"]["levels"]["1e-3"]["solved"] == 2
+    assert list(results["tasks"]) == ["bowl-2d", "bowl-5d"]
     for picture in ("evaluations.png", "bowl-2d/error-vs-time.png"):
         assert (tmp_path / "bowls" / picture).read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_command_line_names_what_there_is(capsys):
-    cli.main(["list"])
-    printed = capsys.readouterr().out
-    assert "cma_es" in printed
-    with pytest.raises(SystemExit):
-        cli.main(["run", "no-such-task"])
-    with pytest.raises(ValueError, match="no method 'x'"):
-        methods.load("x")
-    assert np.all([name in printed for name in methods.METHODS])
+def test_all_scenes_are_run_and_failures_are_named(monkeypatch, tmp_path, capsys):
+    def dark(full):
+        raise NotAble("it lacks light")
+
+    def broken(full):
+        raise ZeroDivisionError("by zero")
+
+    registered(monkeypatch, {"dark": dark, "broken": broken, "stripes": build})
+    cli.main(["run", "all", "--methods", "failing,halving"], tmp_path)
+    shown = capsys.readouterr()
+    assert "dark is not able here: it lacks light." in shown.out
+    assert "broken is not able here: failed: ZeroDivisionError: by zero." in shown.out
+    assert "Failing is not able here: failed: RuntimeError: no luck." in shown.out
+    assert "4/4" in shown.err  # one bar, which forgets what cannot be run
+    results = json.loads((tmp_path / "stripes" / "results.json").read_text())["tasks"]["stripes"]
+    assert results["methods"]["halving"]["took"]["image_error"]["99.9"]["solved"] == 2
+    assert results["pictures"]
 
 
-def test_overhead_is_measured_and_drawn(tmp_path, capsys):
-    overhead.main(tmp_path, pairs=2)
-    assert "smooth_hessian" in capsys.readouterr().out
-    results = json.loads((tmp_path / "results.json").read_text())
-    for found in results["transforms"].values():
-        assert 0 < found["ratio"][0] <= found["ratio"][1] <= found["ratio"][2]
-    assert (tmp_path / "overhead.png").exists()
+def test_an_interruption_ends_all_scenes(monkeypatch, tmp_path):
+    def interrupted(problem):
+        raise jax.errors.JaxRuntimeError("KeyboardInterrupt: ")
+
+    registered(monkeypatch, methods={"halving": interrupted})
+    with pytest.raises(KeyboardInterrupt):
+        cli.main(["run", "all", "--methods", "halving"], tmp_path)
 
 
-def test_overhead_compares_at_the_same_points():
-    seen = []
+def test_nothing_is_lost_by_a_kill(monkeypatch, tmp_path):
+    script = """
+import sys
+from pathlib import Path
+import pytest
+sys.path.insert(0, sys.argv[1])
+import test_benchmarks as here
+from benchmarks import __main__ as cli
+here.registered(pytest.MonkeyPatch(), methods={"killing": here.killing})
+cli.main(["run", "all"], Path(sys.argv[2]))
+"""
+    here = Path(__file__).parent
+    command = [sys.executable, "-c", script, str(here), str(tmp_path)]
+    killed = subprocess.run(command, cwd=here.parent, capture_output=True, text=True)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    (path,) = (tmp_path / "stripes" / "raw").glob("*/*.npz")
+    before = path.read_bytes()
+    registered(monkeypatch, methods={"killing": halving})
+    cli.main(["run", "all"], tmp_path)
+    assert path.read_bytes() == before
+    results = json.loads((tmp_path / "stripes" / "results.json").read_text())["tasks"]["stripes"]
+    assert results["methods"]["killing"]["starts"] == 2
 
-    def loss(y):
-        jax.debug.callback(lambda y: seen.append(np.asarray(y)), y)
-        return jnp.sum(y)
 
-    y = jnp.asarray(BOX10_START)
-    key = jax.random.key(0)
-    transform = sd.smooth_grad(loss, 0.1, num_samples=4, sampler=overhead.SAMPLER)
-    jax.block_until_ready(transform(key, y))
-    jax.effects_barrier()
-    z, _ = overhead.SAMPLER.draw(key, 0, 4, 4, y.size, y.dtype)
-    drawn, used = np.asarray(y) + 0.1 * np.asarray(z), np.stack(seen)
-    assert used[used[:, 0].argsort()] == pytest.approx(drawn[drawn[:, 0].argsort()])
+def killing(problem):
+    """Ends the process, as a kill from outside would, in its second run."""
+    solve = halving(problem)
+
+    def killed(y0, key, record):
+        if float(y0[1]) == 0.1875:
+            os.kill(os.getpid(), signal.SIGKILL)
+        solve(y0, key, record)
+
+    return killed

@@ -1,10 +1,10 @@
-"""Descents: the loop, what is tuned and kept, and that the scenes' gradients are unbiased."""
+"""Descents: what is tuned, run and shown, and that the scenes' gradients are unbiased."""
 
-import json
 from argparse import Namespace
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -13,34 +13,41 @@ import optax
 import pytest
 
 import smoothdiff as sd
-from benchmarks import descents
-from benchmarks.descents import Configuration, Descent, _loop, _runs, keep_within, variants
-from benchmarks.descents._denoising import denoising
-from benchmarks.scenes import piecewise, plate, smoke
-from benchmarks.tasks import aniso, noisy, texture, volume
+from benchmarks import _descents, _registry, _study
+from benchmarks._descent import Configuration, Descent, methods, problem, variants
+from benchmarks._task import Score, Task, TaskEntry
+from benchmarks.scenes import plate, smoke
+from benchmarks.tasks import lines, texture, volume
 
 sgd: Any = optax.sgd
-OPTIONS = Namespace(full=False, seeds=None, fresh=False)
-COMMAND = "python -m benchmarks run bowl"
+OPTIONS = Namespace(full=False, seeds=None, fresh=False, said="python -m benchmarks run bowl")
 
 
-def bowl(curvature=1.0):
+def bowl(name="bowl", high=np.inf):
     """A quadratic whose best rate is 1, but for a little noise."""
+    scene = {"scene": jnp.arange(4.0)}
+
+    def choose(seed):
+        scene["scene"] = seed + jnp.arange(4.0)
+        return scene["scene"]
 
     def gradient(y, key, scene):
-        return {"a": curvature * (y["a"] - scene) + 1e-3 * jax.random.normal(key, (4,))}
+        return {"a": y["a"] - scene + 1e-3 * jax.random.normal(key, (4,))}
 
     return Descent(
-        name="bowl",
+        name=name,
         title="A bowl",
-        scene=lambda seed: seed + jnp.arange(4.0),
-        start=lambda seed, scene: {"a": scene + 1},
-        gradient=gradient,
-        errors=lambda y, scene: {
-            "an unused error": jnp.zeros(()),
-            "error": jnp.linalg.norm(y["a"] - scene),
-        },
-        score="error",
+        problem=problem(gradient, lambda: scene["scene"], {"a": jnp.zeros(4)}, 5, high=high),
+        score=Score(
+            errors=lambda y, scene: {
+                "another": jnp.ones(()),
+                "error": jnp.max(abs(y["a"] - scene)),
+            },
+            levels={"error": (0.1, 1e-9), "another": ()},
+        ),
+        start=lambda seed: {"a": jnp.zeros(4)},
+        seeds=2,
+        choose=choose,
         configurations=(
             Configuration("descent", "Gradient descent", {"": sgd}),
             Configuration(
@@ -49,156 +56,102 @@ def bowl(curvature=1.0):
                 {"slow": lambda rate: sgd(0.1 * rate), "fast": sgd},
                 tuned_at=2,
             ),
+            Configuration("wild", "Wild", {"": lambda rate: sgd(1e30 * (rate - 1.0) + 1.0)}),
         ),
         rates=(0.1, 1.0, 3.0),
         marks=(2, 5),
-        levels=(0.1, 1e-9),
-        seeds=2,
         pictures=lambda y, scene: {"line": y["a"], "grey": jnp.outer(y["a"], y["a"])},
         target=lambda scene: {"line": scene},
-        pictured=(2, 5),
+        pictured=(2,),
     )
 
 
-def test_results_say_what_was_tuned_reached_and_drawn(tmp_path, capsys):
-    descents.run(bowl(), OPTIONS, tmp_path, COMMAND)
-    results = json.loads((tmp_path / "results.json").read_text())
-    assert results["command"] == COMMAND
-    both = results["configurations"]["both"]
+def test_results_say_what_was_tuned_reached_and_drawn(tmp_path, monkeypatch):
+    built: list[Task] = [bowl("one"), replace(bowl("other"), pictures=None)]
+    entry = TaskEntry("Bowls", "descent", lambda full: built)
+    monkeypatch.setattr(_registry, "task", lambda name: entry)
+    measured = _descents.measure("bowl", OPTIONS, tmp_path)
+    results = _study.write(_study.about(OPTIONS) | measured, tmp_path)
+    configurations = results["tasks"]["one"]["configurations"]
+    both = configurations["both"]
     assert (both["variant"], both["rate"], both["at_edge"]) == ("fast", 1.0, False)
     assert set(both["tried"]) == {"slow", "fast"}
     assert both["to_levels"]["0.1"]["median"] == 1  # the first step of rate 1 gets there
     assert both["to_levels"]["1e-09"]["median"] is None
     assert both["at_marks"]["error"]["2"]["upper"] < 0.01
-    assert len(both["seconds"]) == results["configurations"]["descent"]["runs"] == 2
-    for name in ("error-vs-iterations", "error-vs-time", "pictures-2", "pictures-5"):
+    assert configurations["wild"]["rate"] == 1.0  # what diverges is never chosen
+    assert configurations["wild"]["tried"][""]["3.0"] is None
+
+    for grids in (_descents.tables(results), _descents.compare(results, results)):
+        assert [len(grid.rows) for grid in grids] == 2 * 3 * [len(configurations)]
+    _descents.draw(results, tmp_path)
+    for name in ("one/pictures-2", "other/error-vs-iterations", "other/error-vs-time"):
         assert (tmp_path / f"{name}.png").stat().st_size > 1000
-    assert "Two variants" in capsys.readouterr().out
 
-
-def test_runs_are_kept_and_redone_when_the_program_changes(tmp_path, monkeypatch):
-    ran = []
-    run = _loop.Loop.__call__
-    monkeypatch.setattr(
-        _loop.Loop, "__call__", lambda self, *args: ran.append(args) or run(self, *args)
-    )
-
-    def runs(descent, fresh=False):
-        ran.clear()
-        _runs.run_all(descent, descent.seeds, tmp_path, fresh=fresh, progress=False)
-        return len(ran)
-
-    one = replace(bowl(), configurations=bowl().configurations[:1])
-    everything = 3 * one.tuning_seeds + one.seeds
-    assert runs(one) == everything
-    assert {args[1] for args in ran} == {0, 1, 1000, 1001}  # tuned on other starts than scored
-    assert runs(one) == 0
-    assert runs(replace(one, seeds=3)) == 1
-    assert runs(replace(one, gradient=bowl(2.0).gradient)) == everything
-    assert runs(one, fresh=True) == everything
-    # a configuration that does the same under another name shares the runs
-    again = one.configurations[0]._replace(name="again")
-    assert runs(replace(one, configurations=(again,))) == 0
-    assert not list(tmp_path.glob("*.tmp"))
+    raw = sorted(tmp_path.glob("raw/*.npz"))
+    tuning, scored = 2 * 3 * (1 + 2 + 1), 2 * 3  # the tasks share their runs
+    assert len(raw) == tuning + scored
+    assert {path.stem.split("-")[-2] for path in raw} == {"0", "1", "1000", "1001"}
+    written = [path.stat().st_mtime_ns for path in raw]
+    built.pop(0)
+    again = _descents.measure("bowl", OPTIONS, tmp_path)["tasks"]["other"]
+    assert again == measured["tasks"]["other"]
+    assert [path.stat().st_mtime_ns for path in raw] == written
 
 
 def test_a_run_is_the_loop_that_optax_documents():
-    descent = bowl()
-    scene = descent.scene(7)
+    """With bounds, at which it stays."""
     momentum: Any = partial(optax.sgd, momentum=0.5)
-    run = _loop.Loop(descent, momentum)(0.1, 7, scene, 5, keep=(5,))
-    y: Any = descent.start(7, scene)
-    transform = momentum(0.1)
-    state = transform.init(y)
+    task = replace(bowl(high=1.5), rates=(0.4,), marks=(5,))
+    scene, found, key = task.scene(0), {}, jax.random.key(7)
+    [method] = methods(task, Configuration("m", "M", {"": momentum})).values()
+    record = lambda y, iterations: found.update({iterations: y["a"]})
+    method.prepare(task.problem)(task.start(0), key, record)
+    y: Any = task.start(0)
+    transform = momentum(0.4)
+    state, gradient = transform.init(y), cast(Callable, task.problem.gradient)
     for i in range(5):
-        gradient = descent.gradient(y, jax.random.fold_in(jax.random.key(7), i), scene)
-        updates, state = transform.update(gradient, state, y)
-        y = optax.apply_updates(y, updates)
-    np.testing.assert_allclose(run.kept[5]["a"], y["a"], rtol=1e-5)
-    assert run.iterations[-1] == 5
-    assert run.errors["error"][-1] == pytest.approx(np.linalg.norm(y["a"] - scene), rel=1e-5)
-    assert (np.diff(run.seconds) > 0).all()
-
-
-def test_what_diverges_is_never_chosen(tmp_path):
-    wild = Configuration("wild", "Wild", {"": lambda rate: sgd(1e30 * (rate - 1.0) + 1.0)})
-    descent = replace(bowl(), configurations=(wild,), pictures=None, rates=(0.1, 1.0, 3.0))
-    descents.run(descent, OPTIONS, tmp_path, COMMAND)
-    results = json.loads((tmp_path / "results.json").read_text())  # strict: no NaN
-    assert results["configurations"]["wild"]["rate"] == 1.0
-    assert results["configurations"]["wild"]["tried"][""]["3"] is None
-
-
-def test_keep_within_stops_at_the_bounds():
-    y = jnp.array([0.1, 0.5, 0.9])
-    clip: Any = keep_within(0.0, 1.0)
-    updates, _ = clip.update(jnp.array([-1.0, 0.1, 1.0]), clip.init(y), y)
-    np.testing.assert_allclose(y + updates, [0.0, 0.6, 1.0], rtol=1e-6)
-    with pytest.raises(ValueError, match="update"):
-        clip.update(updates, clip.init(y))
+        slope = gradient(y, jax.random.fold_in(key, i), scene)
+        updates, state = transform.update(slope, state, y)
+        y = jax.tree.map(lambda x: jnp.minimum(x, 1.5), optax.apply_updates(y, updates))
+    np.testing.assert_allclose(found[5], y["a"], rtol=1e-5)
+    assert list(found)[-1] == 5
+    assert (found[5][2:] == 1.5).all()
 
 
 def test_variants_tie_the_rates_of_decay():
-    seen = []
-
-    def build(rate, b1, b2, filter):
-        seen.append((b1, b2, filter))
-        return optax.sgd(rate)
-
-    found = variants((0.2, 0.5), {"a": None, "b": None}, build)
-    for optimiser in found.values():
-        optimiser(0.1)
+    build: Any = lambda *arguments: arguments
+    found: Any = variants((0.2, 0.5), {"a": None, "b": None}, build)
     assert list(found) == ["b1=0.2 a", "b1=0.2 b", "b1=0.5 a", "b1=0.5 b"]
-    np.testing.assert_allclose([b2 for _, b2, _ in seen], [0.36, 0.36, 0.75, 0.75])
-
-
-def test_denoising_chooses_on_another_draw(tmp_path):
-    exact = jnp.ones((8, 8))
-    found = denoising(
-        lambda key: exact + jax.random.normal(key, (8, 8)),
-        exact,
-        exact,
-        {"Mean": {"none": lambda x, y: x, "all": lambda x, y: jnp.full_like(x, jnp.mean(x))}},
-        tmp_path / "drawn.png",
-    )
-    assert found["Mean"]["variant"] == "all"
-    assert found["Mean"]["error"] < 0.5 < found["Noisy gradient"]["error"]
-    assert found["Mean"]["wrong_signs"] == 0 < found["Noisy gradient"]["wrong_signs"]
-    assert (tmp_path / "drawn.png").exists()
+    b2s = [optimiser(0.1)[1] for optimiser in found.values()]
+    np.testing.assert_allclose(b2s, [0.36, 0.36, 0.75, 0.75])
 
 
 def test_signals_are_piecewise_smooth():
-    y = piecewise.signal(3, 1000)
+    y = lines.signal(3, 1000)
     jumps = np.sort(np.abs(np.diff(y)))[::-1]
-    assert (y == piecewise.signal(3, 1000)).all()
+    assert (y == lines.signal(3, 1000)).all()
     assert jumps[0] > 0.1
-    assert jumps[piecewise.PIECES - 1] < 0.01
+    assert jumps[lines.PIECES - 1] < 0.01
 
 
-def _uncached(task):
-    scene = getattr(task, "scene", None)
-    return getattr(scene, "__wrapped__", scene)
-
-
-@pytest.mark.parametrize("task", [aniso, noisy, texture, volume])
-def test_tasks_fit_together(task, monkeypatch):
-    # without the cache, which would keep what is traced here
-    monkeypatch.setattr(task, "scene", _uncached(task), raising=False)
-    built = task.build(False)
-    for descent in [built] if isinstance(built, Descent) else built:
-        scene = jax.eval_shape(lambda descent=descent: descent.scene(0))
-        y = jax.eval_shape(lambda scene, descent=descent: descent.start(0, scene), scene)
-        key = jax.eval_shape(lambda: jax.random.key(0))
-        gradient = jax.eval_shape(descent.gradient, y, key, scene)
-        assert jax.tree.structure(gradient) == jax.tree.structure(y)
-        pairs = zip(jax.tree.leaves(gradient), jax.tree.leaves(y), strict=True)
-        assert all((one.shape, one.dtype) == (two.shape, two.dtype) for one, two in pairs)
-        errors = jax.eval_shape(descent.errors, y, scene)
-        assert descent.score in errors
+@pytest.mark.parametrize("build", [lines.aniso, lines.noisy, texture.build, volume.build])
+def test_tasks_fit_together(build):
+    built = build(False)
+    for descent in built if isinstance(built, list) else [built]:
+        y = descent.start(0)
+        scene = jax.eval_shape(descent.problem.scene)
+        gradient = jax.eval_shape(descent.problem.gradient, y, jax.random.key(0), scene)
+        alike = lambda one, two: (one.shape, one.dtype) == (two.shape, two.dtype)
+        assert jax.tree.all(jax.tree.map(alike, gradient, y))
+        errors = jax.eval_shape(descent.score.errors, y, scene)
+        assert set(errors) == set(descent.score.levels)
         assert all(error.shape == () for error in errors.values())
         assert set(descent.pictured) <= set(descent.marks)
         names = [each.name for each in descent.configurations]
         assert len(set(names)) == len(names)
+    for module in (texture, volume):
+        module.scene.cache_clear()  # it was not computed
 
 
 def mean_and_error(draws):
@@ -206,6 +159,7 @@ def mean_and_error(draws):
     return draws.mean(0), draws.std(0, ddof=1) / np.sqrt(len(draws))
 
 
+@pytest.mark.slow
 def test_gradients_of_the_plate_are_unbiased():
     size = 6
     reference = jnp.full((size, size, 3), 0.3)
@@ -227,7 +181,7 @@ def test_gradients_of_the_plate_are_unbiased():
 def test_the_derivative_of_the_plate_is_that_of_its_picture():
     y = jnp.full((2, 2), 0.5)
     step = 0.02
-    image = lambda y: jnp.sum(plate.exact(y, 50_000))
+    image = lambda y: jnp.sum(plate.exact(y, 5_000))
     difference = (image(y + step) - image(y - step)) / (2 * step)
     assert jnp.sum(jax.grad(image)(y)) == pytest.approx(float(difference), rel=0.02)
 
@@ -235,7 +189,7 @@ def test_the_derivative_of_the_plate_is_that_of_its_picture():
 def test_one_moment_with_a_filter_that_does_nothing_is_adam():
     same = lambda signal, guide: signal
     for name in ("m", "v"):
-        mine: Any = texture.one_moment(name, 0.1, 0.2, 0.36, same)
+        mine: Any = texture.one_moment(name, 0.2, 0.36, same, 0.1)
         adam: Any = sd.filtered_adam(0.1, 0.2, 0.36)
         y = jnp.array([1.0, -2.0])
         state, theirs = mine.init(y), adam.init(y)
@@ -265,6 +219,7 @@ def test_nothing_is_seen_as_the_background_and_much_of_it_as_its_colour():
     np.testing.assert_allclose(middle, 0.5, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_gradients_of_the_smoke_have_one_mean_however_noisy():
     volume, camera = small_smoke(), smoke.cameras(2)
     reference = jnp.full((2, 4, 4, 3), 0.2)

@@ -14,6 +14,8 @@ MODULES = sorted(module.name for module in pkgutil.walk_packages(sd.__path__, pr
 TRANSFORMS = sorted(name for name in sd.__all__ if name.startswith("smooth"))
 # modules of optional extras import what the test extra brings
 EXAMPLES = ["smoothdiff", *MODULES]
+# whole runs that take long to compile; `minimise` and `least_squares` have quicker ones
+LONG = [name for name in MODULES if name.startswith("smoothdiff._solvers.")]
 
 
 @pytest.mark.parametrize("name", sd.__all__)
@@ -37,6 +39,7 @@ def test_transforms_say_all_there_is_to_say(name):
     assert not blank
     for section in ("Args:", "Returns:", "Raises:", "Example:", "Source:"):
         assert f"\n{section}" in doc, section
+    assert "\n    >>> " in doc[doc.index("\nExample:") :]
     for parameter in inspect.signature(getattr(sd, name)).parameters:
         if parameter in ("fun", "sigma"):
             assert f"{parameter}: " in doc
@@ -45,7 +48,10 @@ def test_transforms_say_all_there_is_to_say(name):
             assert f"{parameter}: " in (inspect.getdoc(sd.Options) or ""), parameter
 
 
-@pytest.mark.parametrize("name", EXAMPLES)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=pytest.mark.slow if n in LONG else []) for n in EXAMPLES],
+)
 def test_examples_run(name):
     module = importlib.import_module(name)
     runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
@@ -53,9 +59,3 @@ def test_examples_run(name):
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         for example in doctest.DocTestFinder(exclude_empty=True).find(module, name):
             assert runner.run(example).failed == 0
-
-
-def test_the_transforms_have_examples():
-    finder = doctest.DocTestFinder()
-    for name in TRANSFORMS:
-        assert any(test.examples for test in finder.find(getattr(sd, name), name)), name

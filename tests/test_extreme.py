@@ -1,30 +1,40 @@
-"""What `python -m benchmarks stress` looks at, as far as it is fast: every check holds."""
+"""What `python -m benchmarks stress` looks at: every check holds; most of it takes long."""
 
+from argparse import Namespace
 from functools import partial
 
 import pytest
 
-from benchmarks import stress
-from benchmarks.stress._check import Check
+from benchmarks import _study
+from benchmarks.studies import stress
+from benchmarks.studies.stress import faults, memory, scales, shapes, simulator
+from benchmarks.studies.stress._check import Check
 
-FAST = {
-    "offset": partial(stress.offset, baselines=("mean", "gp")),
-    "scale": stress.scale,
-    "width": stress.width,
-    "decades": partial(stress.decades, baselines=("gp",)),
-    "plateaus": stress.plateaus,
-    "stiff": stress.stiff,
-    "rosenbrock": stress.rosenbrock,
-    "definiteness": stress.definiteness,
-    "negated Gaussian": stress.negated_gaussian,
-    "oscillator": partial(stress.oscillator, jumps=1, num_samples=64),
-    "million": partial(stress.million, samplers=("Sobol",), num_samples=16),
-    "log-weights": partial(stress.log_weights, sizes=(1, 10_000)),
-    "holes": partial(stress.holes, baselines=("mean", "center", "gp")),
+CHEAP = {
+    "scale": partial(scales.scale, baselines=("mean",)),
+    "log-weights": partial(faults.log_weights, sizes=(1,)),
 }
+DEAR = {
+    "offset": partial(scales.offset, baselines=("mean", "gp"), places=8),
+    "scale, gp": partial(scales.scale, baselines=("gp",)),
+    "width": scales.width,
+    "decades": partial(scales.decades, baselines=("gp",)),
+    "plateaus": shapes.plateaus,
+    "stiff": shapes.stiff,
+    "rosenbrock": shapes.rosenbrock,
+    "definiteness": shapes.definiteness,
+    "negated Gaussian": shapes.negated_gaussian,
+    "oscillator": partial(simulator.oscillator, jumps=1, num_samples=64),
+    "million": partial(memory.million, samplers=("Sobol",), num_samples=16),
+    "log-weights, 10,000": partial(faults.log_weights, sizes=(10_000,)),
+    "holes": partial(faults.holes, baselines=("mean", "center", "gp")),
+}
+DEARER = [pytest.param(case, id=name, marks=pytest.mark.slow) for name, case in DEAR.items()]
 
 
-@pytest.mark.parametrize("case", FAST.values(), ids=FAST)
+@pytest.mark.parametrize(
+    "case", [*(pytest.param(case, id=name) for name, case in CHEAP.items()), *DEARER]
+)
 def test_every_check_holds(case):
     checks = list(case())
     assert checks
@@ -33,13 +43,13 @@ def test_every_check_holds(case):
 
 def test_verdicts_are_written_and_shown(monkeypatch, tmp_path, capsys):
     monkeypatch.setenv("COLUMNS", "150")
-    nan = float("nan")
     checks = [
         Check("good", "kg", 2.0, 1.0),
         Check("bad", "kg", 2.0, 3.0),
-        Check("void", "m", 0, nan),
+        Check("void", "m", 0, float("nan")),
     ]
-    stress.main(tmp_path, {"scales": lambda: iter(checks)})
+    monkeypatch.setattr(stress, "CASES", {"scales": lambda: iter(checks)})
+    _study.run(stress, Namespace(said="a test"), tmp_path)
     printed = capsys.readouterr().out
     assert "1 of 2 fail" in printed
     assert "1 of 1 fail" in printed

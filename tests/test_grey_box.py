@@ -76,6 +76,7 @@ def estimate(kind, num_samples):
 EXACT = {"inside": loss_inside, "outside": loss_outside}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     # the loss outside is O(1/N) biased from one batch, so N is large there
     ("kind", "num_samples", "num_keys"),
@@ -103,6 +104,7 @@ def test_gradient_and_hessian_of_the_whole_composition(kind, num_samples, num_ke
     assert jnp.max(jnp.abs(mean - dropped) / spread) > 20
 
 
+@pytest.mark.slow
 def test_the_two_objectives_are_told_apart():
     """E L(f) and L(E f) differ by the variance of the pixels; one batch of N adds 1/N of it."""
     theta = network(PHI)

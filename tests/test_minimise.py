@@ -46,8 +46,12 @@ class Host:
 HOST = Host()
 
 
-def host_plateaus(y, args):
-    return HOST.box(y)
+def host_plateaus(y, edge):
+    """NaN beyond an edge, without one nowhere."""
+    return jnp.where(y[0] > edge, jnp.nan, HOST.box(y))
+
+
+NO_EDGE = jnp.asarray(np.inf)
 
 
 @pytest.fixture
@@ -89,37 +93,43 @@ def path(tmp_path):
 # the iterates
 
 
-def test_iterates_are_those_of_optimistix_to_the_last_bit(dtype):
+@pytest.mark.parametrize(
+    ("dtype", "to_the_last_bit"),
+    [
+        ("float32", False),
+        # as users compile them
+        pytest.param("float32", True, marks=pytest.mark.slow),
+        pytest.param("float64", True, marks=pytest.mark.slow),
+    ],
+    indirect=["dtype"],
+)
+def test_iterates_are_those_of_optimistix(dtype, to_the_last_bit):
     y0, target, bounds = jnp.zeros(2, dtype), TARGET.astype(dtype), (-1.0, 0.5)
     options = {"key": KEY, "bounds": bounds}
     solution = optx.minimise(waves, ANNEALED, y0, target, options, max_steps=40, throw=False)
     result = sd.minimise(waves, y0, target, key=KEY, solver=ANNEALED, max_steps=40, bounds=bounds)
     assert result.y.dtype == dtype
-    np.testing.assert_array_equal(result.y, solution.value)
+    rtol = 0 if to_the_last_bit else 1e-4
+    np.testing.assert_allclose(result.y, solution.value, rtol=rtol)
     for name in ("fun", "stderr", "evaluations"):
-        assert getattr(result, name) == solution.stats[name]
+        np.testing.assert_allclose(getattr(result, name), solution.stats[name], rtol=rtol)
     assert result.evaluations == 40 * N + JUDGING
-    assert result.history[-1].fun == solution.state.progress.fun
+    np.testing.assert_allclose(result.history[-1].fun, solution.state.progress.fun, rtol=rtol)
 
 
-def test_a_new_key_does_not_trace_the_function_again():
+def test_a_new_key_does_not_trace_the_function_again_and_a_raw_one_gives_the_same_run():
     traces = []
 
     def fun(y, args):
         traces.append(1)
         return waves(y, TARGET)
 
-    run = lambda seed: sd.minimise(fun, Y0, key=jax.random.key(seed), solver=ADAM, max_steps=3)
-    first, before = run(0), len(traces)
-    second = run(1)
+    run = lambda key: sd.minimise(fun, Y0, key=key, solver=ADAM, max_steps=3)
+    first, before = run(jax.random.key(3)), len(traces)
+    second = run(jax.random.key(4))
     assert len(traces) == before
     assert first.fun != second.fun
-    assert_same(first, run(0))
-
-
-def test_raw_and_typed_keys_give_the_same_run():
-    run = lambda key: sd.minimise(waves, Y0, TARGET, key=key, solver=ADAM, max_steps=3)
-    assert_same(run(jax.random.key(3)), run(jax.random.PRNGKey(3)))
+    assert_same(first, run(jax.random.PRNGKey(3)))
 
 
 def test_history_says_what_happened():
@@ -148,7 +158,7 @@ def test_history_says_what_happened():
 
 @pytest.mark.parametrize("budget", [N + JUDGING, 2 * N + JUDGING - 1, 100])
 def test_max_evaluations_is_never_exceeded(budget, host):
-    result = sd.minimise(host_plateaus, Y0, key=KEY, solver=ADAM, max_evaluations=budget)
+    result = sd.minimise(host_plateaus, Y0, NO_EDGE, key=KEY, solver=ADAM, max_evaluations=budget)
     assert result.reason == "max_evaluations"
     assert budget - N < host.count <= budget
     assert result.evaluations == host.count
@@ -221,7 +231,7 @@ def test_the_result_is_judged_on_fresh_samples_not_on_luck():
 
 def test_ctrl_c_in_the_callback_returns_what_has_been_found(host):
     result = sd.minimise(
-        host_plateaus, Y0, key=KEY, solver=ADAM, callback=stop_at(6, KeyboardInterrupt)
+        host_plateaus, Y0, NO_EDGE, key=KEY, solver=ADAM, callback=stop_at(6, KeyboardInterrupt)
     )
     assert (result.reason, len(result.history)) == ("interrupted", 6)
     assert result.evaluations == host.count == 6 * N
@@ -234,14 +244,16 @@ def test_ctrl_c_in_the_callback_returns_what_has_been_found(host):
 @pytest.mark.parametrize("at", [3, 6 * N + 3])
 def test_ctrl_c_in_the_black_box_returns_what_has_been_found(at, host):
     host.at, host.error = at, KeyboardInterrupt()
-    result = sd.minimise(host_plateaus, Y0, key=KEY, solver=ADAM)
+    result = sd.minimise(host_plateaus, Y0, NO_EDGE, key=KEY, solver=ADAM)
     assert (result.reason, len(result.history)) == ("interrupted", at // N)
     assert np.all(np.isfinite(result.y))
 
 
 @pytest.mark.parametrize("at", [6 * N + 3, 10 * N + 3], ids=["in a step", "while judging"])
 def test_a_black_box_that_raises_loses_nothing(at, host, path):
-    run = functools.partial(sd.minimise, host_plateaus, Y0, key=KEY, solver=ADAM, max_steps=10)
+    run = functools.partial(
+        sd.minimise, host_plateaus, Y0, NO_EDGE, key=KEY, solver=ADAM, max_steps=10
+    )
     whole = run()
     host.at, host.error = host.count + at, OverflowError("too bright")
     with pytest.raises(sd.MinimiseError, match="too bright") as caught:
@@ -255,23 +267,19 @@ def test_a_black_box_that_raises_loses_nothing(at, host, path):
 
 
 def test_a_step_that_is_not_finite_raises_and_keeps_the_result(host):
-
-    def fails_beyond(y, edge):
-        return jnp.where(y[0] > edge, jnp.nan, host.box(y))
-
-    solver = sd.FirstOrder(optax.adam(0.01), 0.1, num_samples=N, nonfinite="drop")
+    edge = jnp.asarray(0.3)
+    solver = sd.FirstOrder(optax.adam(0.05), 0.2, num_samples=N, nonfinite="drop")
     with pytest.raises(sd.MinimiseError, match="NaN or infinite") as caught:
-        sd.minimise(fails_beyond, Y0, 0.3, key=KEY, solver=solver, max_steps=100)
+        sd.minimise(host_plateaus, Y0, edge, key=KEY, solver=solver, max_steps=100)
     assert caught.value.__cause__ is None
     found = caught.value.result
     assert found.reason == "nonfinite"
     assert np.all(np.isfinite([*found.y, found.fun, found.stderr]))
     assert found.evaluations == host.count == (len(found.history) + 1) * N
     # it went on until about half of the samples failed, where the other stops at the first one
-    assert 0.2 < found.history[-1].y[0] < 0.4
-    propagate = sd.FirstOrder(optax.adam(0.01), 0.1, num_samples=N)
+    assert 0.1 < found.history[-1].y[0] < 0.5
     with pytest.raises(sd.MinimiseError) as caught:
-        sd.minimise(fails_beyond, Y0, 0.3, key=KEY, solver=propagate, max_steps=100)
+        sd.minimise(host_plateaus, Y0, edge, key=KEY, solver=ADAM, max_steps=100)
     assert len(caught.value.result.history) < len(found.history)
 
 
@@ -284,7 +292,8 @@ def test_an_error_in_the_callback_is_the_callers():
 
 
 def test_a_resumed_run_ends_with_the_same_bits(path):
-    run = functools.partial(sd.minimise, waves, Y0, TARGET, key=KEY, solver=ANNEALED)
+    bounds = (-1.0, 0.5)
+    run = functools.partial(sd.minimise, waves, Y0, TARGET, key=KEY, solver=ANNEALED, bounds=bounds)
     whole = run(max_steps=20)
     for step in (1, 7, 13):
         with pytest.raises(StopHereError):
@@ -363,7 +372,7 @@ def test_a_file_that_is_no_checkpoint_is_refused(content, tmp_path):
     ],
 )
 def test_bad_input_is_refused_before_any_evaluation(change, error, match, host):
-    call = {"fun": host_plateaus, "y0": Y0, "key": KEY, "solver": ADAM, **change}
+    call = {"fun": host_plateaus, "y0": Y0, "args": NO_EDGE, "key": KEY, "solver": ADAM, **change}
     with pytest.raises(error, match=match):
         sd.minimise(**call)
     assert host.count == 0

@@ -429,7 +429,9 @@ def test_wrong_parameters_are_told_when_traced():
 
 
 def test_only_the_shadow_of_the_sphere_is_in_the_picture():
-    loaded = mi.load_dict(shadow.scene_dict(16), optimize=False)
+    described = shadow.scene(T())
+    described["camera"]["film"] |= {"width": 16, "height": 16}
+    loaded = mi.load_dict(described, optimize=False)
     what = mi.load_dict({"type": "aov", "aovs": "shape:shape_index"})
     parameters = mi.traverse(loaded)
     shapes = set()

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from smoothdiff._solvers._metric import MOST_DIRECTIONS, Metric
+from smoothdiff._solvers._noisy_step import outcome
+from smoothdiff._solvers._scalar_fit import fit
 from smoothdiff._solvers._trust_region import truncated_cg
 
 # the inner solver
@@ -57,6 +59,39 @@ def test_without_a_gradient_there_is_no_step(dtype):
     np.testing.assert_array_equal(step, 0)
 
 
+# what is made of a step
+
+
+def test_a_step_is_good_if_it_led_down_or_may_have():
+    """From the point before to the origin, on a bowl and on nothing but noise."""
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(40, 2)).astype(np.float32)
+    bowl = np.sum((points - 3) ** 2, axis=1)
+    noise = rng.normal(size=40).astype(np.float32)
+
+    @jax.jit
+    @functools.partial(jax.vmap, in_axes=(None, 0, 0, 0))
+    def judged(points, values, before, promised):
+        return outcome(fit(points, values, jnp.ones(40, bool)), before, promised)
+
+    # from here to the origin the bowl falls by as much
+    up, down = np.array([0.5, 0.5], np.float32), np.array([-0.5, -0.5], np.float32)
+    fall = np.float32(2 * (3.5**2 - 3**2))
+    steps = {
+        "as promised": (bowl, down, fall, 1),
+        "less than promised": (bowl, down, 10 * fall, 0.1),
+        "next to nothing of it": (bowl, down, 1000 * fall, 0),
+        "up": (bowl, up, fall, -(3**2 - 2.5**2) / (3.5**2 - 3**2)),
+        "up in noise": (noise, up, np.float32(1e-3), None),
+        "no step": (noise, 0 * up, np.float32(0), 1),
+    }
+    columns = [np.stack(column) for column in list(zip(*steps.values(), strict=True))[:3]]
+    for name, good, ratio in zip(steps, *judged(points, *columns), strict=True):
+        expected = steps[name][3]
+        assert good == (name not in ("next to nothing of it", "up")), name
+        assert expected is None or ratio == pytest.approx(expected, abs=0.03), name
+
+
 # the metric
 
 
@@ -64,14 +99,15 @@ def settled(hessian, metric):
     """The metric after many steps on one Hessian, without noise."""
 
     @jax.jit
-    def advance(metric):
-        product = lambda v: jnp.matmul(metric.matrix.T, hessian @ (metric.matrix @ v))
-        whole = metric.matrix.T @ hessian @ metric.matrix
-        return metric.adapted(product, jnp.diagonal(whole), jnp.zeros(()))[0]
+    def advanced(metric):
+        def advance(_, metric):
+            product = lambda v: jnp.matmul(metric.matrix.T, hessian @ (metric.matrix @ v))
+            whole = metric.matrix.T @ hessian @ metric.matrix
+            return metric.adapted(product, jnp.diagonal(whole), jnp.zeros(()))[0]
 
-    for _ in range(60):
-        metric = advance(metric)
-    return metric
+        return jax.lax.fori_loop(0, 60, advance, metric)
+
+    return advanced(metric)
 
 
 def test_widths_follow_the_hessian_to_its_inverse_root(x64):

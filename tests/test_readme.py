@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks import __main__ as cli
-from benchmarks import methods
+from benchmarks import _registry
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "benchmarks" / "README.md", ROOT / "CONTRIBUTING.md"]
@@ -21,6 +21,7 @@ def blocks():
     return re.findall(r"```python\n(.*?)```", PAGES[0].read_text(), re.DOTALL)
 
 
+@pytest.mark.slow
 def test_examples_run_one_after_the_other(blocks):
     names = {}
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
@@ -51,4 +52,4 @@ def test_commands_are_understood(page):
         # any task stands for all where a page says TASK
         options = cli.parser().parse_args(re.sub(r"\bTASK\b", "led", said).split())
         named = getattr(options, "methods", None)
-        assert not named or set(named.split(",")) <= set(methods.METHODS), said
+        assert not named or set(named.split(",")) <= set(_registry.methods()), said

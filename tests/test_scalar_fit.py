@@ -10,21 +10,38 @@ from closed_forms import half_space, smoothed_half_space
 
 from smoothdiff._solvers._scalar_fit import fit
 
-fitted = jax.jit(fit)
+DIRECTION = np.array([0.6, 0.8])
+
+
+@jax.jit
+def told(points, values, valid, at):
+    """All that a fit says at a place; compiled once for each number of samples and dtype."""
+    model = fit(points, values, valid)
+    slope, exact = jax.grad(model.value)(at), jax.hessian(model.value)(at)
+    along = jnp.ones_like(at) if at.size != 2 else jnp.asarray(DIRECTION, at.dtype)
+    return {
+        "model": model,
+        "value": model.value(at),
+        "grad": model.grad(at),
+        "hessian": jax.vmap(model.curvature(at))(jnp.eye(at.size, dtype=at.dtype)),
+        "diagonal": model.curvature_diagonal(at),
+        "grad by AD": slope,
+        "hessian by AD": exact,
+        "value_stderr": model.value_stderr(at),
+        "difference_stderr": model.difference_stderr(at),
+        "grad_stderr": model.grad_stderr(at),
+        "curvature_stderr": model.curvature_stderr(at, along),
+    }
 
 
 def samples(n, m, dtype, seed=0):
     points = np.random.default_rng(seed).normal(size=(m, n))
-    return jnp.asarray(points, dtype), jnp.ones(m, bool)
+    return points.astype(dtype), np.ones(m, bool)
 
 
 def rough(points):
     """Hard edges on a bend: no quadratic."""
-    return jnp.sum(jnp.floor(2 * points), axis=1) + jnp.sin(3 * points[:, 0])
-
-
-def hessian(model, at):
-    return jax.vmap(model.curvature(at))(jnp.eye(at.size, dtype=at.dtype))
+    return np.sum(np.floor(2 * points), axis=1) + np.sin(3 * points[:, 0])
 
 
 @pytest.fixture(scope="module")
@@ -42,57 +59,50 @@ def known():
 def test_a_quadratic_is_reproduced(at, known, dtype):
     value, smoothed, slope, bend = known
     points, valid = samples(3, 20, dtype)
-    model = fitted(points, jnp.asarray(value(np.asarray(points)), dtype), valid)
-    place, at = jnp.asarray(at, dtype), np.asarray(at)
+    at = np.asarray(at, dtype)
+    found = told(points, np.asarray(value(points), dtype), valid, at)
     tolerance = (1e-6 if dtype == np.float64 else 1e-2) * np.max(np.abs(bend))
-    assert model.value(place).dtype == dtype
-    np.testing.assert_allclose(model.value(place), smoothed(at), atol=tolerance)
-    np.testing.assert_allclose(model.grad(place), slope(at), atol=tolerance)
-    np.testing.assert_allclose(hessian(model, place), bend, atol=tolerance)
-    np.testing.assert_allclose(model.curvature_diagonal(place), np.diag(bend), atol=tolerance)
+    assert found["value"].dtype == dtype
+    np.testing.assert_allclose(found["value"], smoothed(at), atol=tolerance)
+    np.testing.assert_allclose(found["grad"], slope(at), atol=tolerance)
+    np.testing.assert_allclose(found["hessian"], bend, atol=tolerance)
+    np.testing.assert_allclose(found["diagonal"], np.diag(bend), atol=tolerance)
 
 
 def test_fewer_samples_than_a_quadratic_has_numbers_still_give_a_descent_direction(x64):
     points, valid = samples(20, 12, np.float64)
     slope = np.linspace(1, 2, 20)
-    model = fitted(points, points @ slope, valid)
-    cosine = model.grad(points[0] * 0) @ slope / np.linalg.norm(slope)
+    grad = jax.jit(lambda *data: fit(*data).grad(jnp.zeros(20)))(points, points @ slope, valid)
+    cosine = grad @ slope / np.linalg.norm(slope)
     # of a random direction the samples see a share of 12 in 20, and the fit no more than that
-    assert 0.6 < cosine / np.linalg.norm(model.grad(points[0] * 0)) < 1
+    assert 0.6 < cosine / np.linalg.norm(grad) < 1
 
 
 @pytest.mark.parametrize("at", [(0.0, 0.0), (0.6, -1.3)], ids=["here", "elsewhere"])
 def test_derivatives_are_those_of_the_value(at, x64):
     points, valid = samples(2, 30, np.float64)
-    model, at = fitted(points, rough(points), valid), jnp.array(at)
-    assert model.radial > 0
+    found = told(points, rough(points), valid, np.array(at))
+    assert found["model"].radial > 0
     close: dict[str, Any] = {"rtol": 1e-9, "atol": 1e-9}
-    slope, exact = jax.jit(lambda f, at: (jax.grad(f.value)(at), jax.hessian(f.value)(at)))(
-        model, at
-    )
-    np.testing.assert_allclose(model.grad(at), slope, **close)
-    np.testing.assert_allclose(hessian(model, at), exact, **close)
-    np.testing.assert_allclose(model.curvature_diagonal(at), jnp.diagonal(exact), **close)
+    np.testing.assert_allclose(found["grad"], found["grad by AD"], **close)
+    np.testing.assert_allclose(found["hessian"], found["hessian by AD"], **close)
+    np.testing.assert_allclose(found["diagonal"], np.diagonal(found["hessian by AD"]), **close)
 
 
 def test_standard_errors_are_those_of_the_gaussian_process_by_quadrature(x64):
     """The covariance of the smoothed function, given the samples, without any closed form."""
     points, valid = samples(2, 14, np.float64)
     # one far away, which counts less
-    points = points.at[0].set(jnp.array([4.0, -3.0]))
-    model = fitted(points, rough(points), valid)
+    points[0] = [4.0, -3.0]
+    at = np.array([0.6, -0.3])
+    found = told(points, rough(points), valid, at)
+    model = found["model"]
     assert model.radial > 0
     assert model.closeness[0] < 0.2
-    at, v = jnp.array([0.6, -0.3]), jnp.array([0.6, 0.8])
-    exact = posterior(model, at, v)
-    found = {
-        "value": model.value_stderr(at),
-        "difference": model.difference_stderr(at),
-        "grad": model.grad_stderr(at),
-        "curvature": model.curvature_stderr(at, v),
-    }
-    for name, error in found.items():
-        np.testing.assert_allclose(error, jnp.sqrt(exact[name]), rtol=1e-6, err_msg=name)
+    exact = posterior(model, jnp.asarray(at), jnp.asarray(DIRECTION))
+    for name, variance in exact.items():
+        error = found[f"{name}_stderr"]
+        np.testing.assert_allclose(error, np.sqrt(variance), rtol=1e-6, err_msg=name)
 
 
 @jax.jit
@@ -137,9 +147,7 @@ def posterior(model, at, v):
 
 def test_standard_errors_are_calibrated_at_a_hard_edge(x64):
     at = jnp.array([0.3, -0.2])
-    sigma = jnp.ones(2)
-    smoothed = lambda u: smoothed_half_space(u, sigma)
-    direction = jnp.array([0.6, 0.8])
+    direction = jnp.asarray(DIRECTION)
 
     def one(key):
         points = jax.random.normal(key, (20, 2))
@@ -153,13 +161,15 @@ def test_standard_errors_are_calibrated_at_a_hard_edge(x64):
             "curvature": (bent, model.curvature_stderr(at, direction)),
         }
 
-    exact = {
-        "value": smoothed(at),
-        "difference": smoothed(at) - smoothed(jnp.zeros(2)),
-        "grad": jax.grad(smoothed)(at),
-        "curvature": jax.hessian(smoothed)(at) @ direction @ direction,
-    }
-    found = jax.jit(lambda keys: jax.lax.map(one, keys))(jax.random.split(jax.random.key(0), 200))
+    @jax.jit
+    def both(keys):
+        smoothed = lambda u: smoothed_half_space(u, jnp.ones(2))
+        value, zero = smoothed(at), smoothed(jnp.zeros(2))
+        bent = jax.hessian(smoothed)(at) @ direction @ direction
+        exact = {"value": value, "difference": value - zero, "grad": jax.grad(smoothed)(at)}
+        return jax.lax.map(one, keys), exact | {"curvature": bent}
+
+    found, exact = both(jax.random.split(jax.random.key(0), 200))
     for name, (estimates, errors) in found.items():
         missed = np.sqrt(np.mean((np.asarray(estimates) - np.asarray(exact[name])) ** 2))
         assert 0.5 < missed / np.sqrt(np.mean(errors**2)) < 2, name
@@ -168,38 +178,33 @@ def test_standard_errors_are_calibrated_at_a_hard_edge(x64):
 @pytest.mark.parametrize("nonsense", [0.0, np.nan, np.inf, 1e30])
 def test_invalid_samples_do_not_count(nonsense, x64):
     points, valid = samples(2, 30, np.float64)
-    values = rough(points)
-    spare, _ = samples(2, 6, np.float64, seed=5)
-    more = fitted(
-        jnp.concatenate([points, spare]),
-        jnp.concatenate([values, jnp.full(6, nonsense)]),
-        jnp.concatenate([valid, jnp.zeros(6, bool)]),
-    )
-    model, at = fitted(points, values, valid), jnp.array([0.3, 0.2])
+    values, at = rough(points), np.array([0.3, 0.2])
+    some = slice(0, 24)
+    valid[24:] = False
+    values[24:] = nonsense
+    more = told(points, values, valid, at)
+    less = told(points[some], values[some], valid[some], at)
     close: dict[str, Any] = {"rtol": 1e-9, "atol": 1e-9}
-    np.testing.assert_allclose(more.value(at), model.value(at), **close)
-    np.testing.assert_allclose(more.grad(at), model.grad(at), **close)
-    np.testing.assert_allclose(hessian(more, at), hessian(model, at), **close)
-    np.testing.assert_allclose(more.value_stderr(at), model.value_stderr(at), **close)
-    np.testing.assert_allclose(more.grad_stderr(at), model.grad_stderr(at), **close)
+    for name in ("value", "grad", "hessian", "value_stderr", "grad_stderr"):
+        np.testing.assert_allclose(more[name], less[name], err_msg=name, **close)
 
 
 @pytest.mark.parametrize("constant", [0.0, -7.25, 1e20])
 def test_constant_values_have_no_slope(constant, dtype):
     points, valid = samples(3, 20, dtype)
-    model, at = fitted(points, jnp.full(20, constant, dtype), valid), jnp.ones(3, dtype)
-    assert model.value(at) == jnp.asarray(constant, dtype)
-    np.testing.assert_array_equal(model.grad(at), 0)
-    np.testing.assert_array_equal(model.curvature(at)(at), 0)
-    for error in (model.value_stderr(at), model.difference_stderr(at), *model.grad_stderr(at)):
-        assert 0 <= error < 1e-3
+    found = told(points, np.full(20, constant, dtype), valid, np.ones(3, dtype))
+    assert found["value"] == np.asarray(constant, dtype)
+    np.testing.assert_array_equal(found["grad"], 0)
+    np.testing.assert_array_equal(found["hessian"], 0)
+    for name in ("value_stderr", "difference_stderr", "grad_stderr"):
+        assert np.all((found[name] >= 0) & (found[name] < 1e-3)), name
 
 
 @pytest.mark.parametrize(("scale", "shift"), [(1e-6, 0.0), (1e4, -3e4)])
 def test_the_units_of_the_values_do_not_matter(scale, shift, x64):
     points, valid = samples(2, 30, np.float64)
-    values, at = rough(points), jnp.array([0.3, 0.2])
-    model, other = fitted(points, values, valid), fitted(points, scale * values + shift, valid)
-    np.testing.assert_allclose(other.value(at), scale * model.value(at) + shift, rtol=1e-7)
-    np.testing.assert_allclose(other.grad(at), scale * model.grad(at), rtol=1e-7)
-    np.testing.assert_allclose(other.grad_stderr(at), scale * model.grad_stderr(at), rtol=1e-7)
+    values, at = rough(points), np.array([0.3, 0.2])
+    one, other = (told(points, v, valid, at) for v in (values, scale * values + shift))
+    np.testing.assert_allclose(other["value"], scale * one["value"] + shift, rtol=1e-7)
+    for name in ("grad", "grad_stderr"):
+        np.testing.assert_allclose(other[name], scale * one[name], rtol=1e-7)

@@ -17,29 +17,34 @@ def weights(surrogate):
     return jax.tree.leaves(eqx.filter(surrogate, eqx.is_array))
 
 
-@pytest.mark.parametrize("size", [1, 3, 60])
+@pytest.mark.parametrize("size", [1, 60])
 @pytest.mark.parametrize("make", [MLP, Quadratic])
 def test_a_point_gives_one_number_and_a_gradient(make, size):
-    surrogate = make(size, key=KEY)
-    value, grad = jax.value_and_grad(surrogate)(jnp.linspace(0.1, 1, size))
+    at_point = lambda u: jax.value_and_grad(make(size, key=KEY))(u)
+    value, grad = jax.jit(at_point)(np.linspace(0.1, 1, size).astype(np.float32))
     assert value.shape == ()
     assert grad.shape == (size,)
-    assert jnp.any(grad != 0)
+    assert np.any(np.asarray(grad) != 0)
 
 
 def test_the_positional_encoding_adds_octaves():
-    surrogate = MLP(3, width=5, depth=1, frequencies=2, key=KEY)
-    u = jnp.array([0.1, 0.2, 0.3])
-    features = jnp.concatenate([u, jnp.sin(u), jnp.sin(2 * u), jnp.cos(u), jnp.cos(2 * u)])
-    np.testing.assert_allclose(surrogate(u), surrogate.layers(features), rtol=1e-6)
-    assert surrogate.layers.layers[0].weight.shape == (5, 15)
+    @jax.jit
+    def both(u):
+        surrogate = MLP(3, width=5, depth=1, frequencies=2, key=KEY)
+        features = [u, jnp.sin(u), jnp.sin(2 * u), jnp.cos(u), jnp.cos(2 * u)]
+        assert surrogate.layers.layers[0].weight.shape == (5, 15)
+        return surrogate(u), surrogate.layers(jnp.concatenate(features))
+
+    np.testing.assert_allclose(*both(jnp.array([0.1, 0.2, 0.3])), rtol=1e-6)
 
 
 def test_only_a_smooth_activation_has_curvature():
-    u = jnp.array([0.3, -0.2])
-    curvature = lambda activation: jax.hessian(MLP(2, activation=activation, key=KEY))(u)
-    np.testing.assert_array_equal(curvature(jax.nn.leaky_relu), 0)
-    assert jnp.any(curvature(jax.nn.gelu) != 0)
+    make = lambda activation: MLP(2, activation=activation, key=KEY)
+    rectified, smooth = jax.jit(
+        lambda u: [jax.hessian(make(f))(u) for f in (jax.nn.leaky_relu, jax.nn.gelu)]
+    )(jnp.array([0.3, -0.2]))
+    np.testing.assert_array_equal(rectified, 0)
+    assert np.any(np.asarray(smooth) != 0)
 
 
 def test_the_quadratic_starts_as_the_identity_and_has_the_curvature_of_its_matrix():
@@ -49,7 +54,7 @@ def test_the_quadratic_starts_as_the_identity_and_has_the_curvature_of_its_matri
     quadratic = eqx.tree_at(lambda q: q.matrix, quadratic, matrix)
     u = jnp.array([0.5, -1.0])
     assert quadratic(u) == jnp.append(u, 1) @ matrix @ jnp.append(u, 1)
-    np.testing.assert_allclose(jax.hessian(quadratic)(u), (matrix + matrix.T)[:2, :2])
+    np.testing.assert_allclose(jax.jit(jax.hessian(quadratic))(u), (matrix + matrix.T)[:2, :2])
 
 
 def test_keys_draw_the_weights():

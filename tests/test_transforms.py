@@ -10,6 +10,7 @@ import pytest
 from closed_forms import (
     CASES,
     PLAIN,
+    Several,
     Widened,
     assert_same,
     assert_unbiased,
@@ -18,89 +19,103 @@ from closed_forms import (
     smoothed_boxes,
     smoothed_step,
     step,
+    taylor,
 )
 
 import smoothdiff as sd
 
 
-def derivatives(g):
-    """Value, gradient and Hessian of g(theta, sigma) in both of its arguments together."""
-
-    def joint(*at):
-        def first(at):
-            value, grad = jax.value_and_grad(lambda at: g(*at))(at)
-            return grad, (value, grad)
-
-        second, (value, grad) = jax.jacfwd(first, has_aux=True)(at)
-        return {"value": value, "grad": grad, "hessian": second}
-
-    return joint
-
-
-def estimates(derived, fun, num_keys, **options):
-    """The same derivatives of the estimate, for many keys."""
-
-    def for_key(key, theta, sigma):
-        g = lambda theta, sigma: sd.smooth(fun, sigma, **options)(key, theta)
-        return derived(g)(theta, sigma)
-
-    run = jax.jit(jax.vmap(for_key, in_axes=(0, None, None)))
-    return lambda theta, sigma: run(keys(num_keys), theta, sigma)
+def for_keys(num, estimate):
+    """What `estimate(key)` gives for many keys, as one program."""
+    return jax.jit(jax.vmap(estimate))(keys(num))
 
 
 # ---------------------------------------------------------------------------------------------
 # closed forms
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_every_derivative_has_its_closed_form(name):
+def padded(name, size):
+    """A function and its smoothed one, in `size` parameters of which the last may do nothing."""
     case = CASES[name]
-    theta, sigma = jnp.array(case.theta), jnp.array(case.sigma)
-    found = estimates(derivatives, case.fun, 512, **PLAIN, num_samples=1024)(theta, sigma)
-    assert_unbiased(found, derivatives(case.smoothed)(theta, sigma), resolution=0.2)
+    n = len(case.theta)
+    fun = lambda x: jnp.asarray(case.fun(x[:n]))
+    smoothed = lambda at: jnp.asarray(case.smoothed(at[:n], at[size : size + n]))
+    rest = (1.0,) * (size - n)
+    return fun, smoothed, (*case.theta, *rest, *case.sigma, *rest)
+
+
+@pytest.mark.parametrize("size", [1, 3, 8])
+def test_every_derivative_has_its_closed_form(size):
+    """Value, first and second derivatives in parameters and sigma of all `CASES` of that size."""
+    names = [n for n, case in CASES.items() if len(case.theta) in {3: (2, 3)}.get(size, (size,))]
+    funs, smoothed, at = zip(*(padded(name, size) for name in names), strict=True)
+    index, at = jnp.arange(len(names)), jnp.array(at)
+
+    def estimate(key):
+        def one(index, at):
+            fun = lambda x: jax.lax.switch(index, funs, x)
+            g = lambda at: sd.smooth(fun, at[size:], **PLAIN, num_samples=1024)(key, at[:size])
+            return taylor(g)(at)
+
+        return jax.lax.map(lambda case: one(*case), (index, at))
+
+    found = for_keys(256, estimate)
+    exact = lambda i, at: taylor(lambda at: jax.lax.switch(i, smoothed, at))(at)
+    want = jax.jit(jax.vmap(exact))(index, at)
+    for i, name in enumerate(names):
+        pick = lambda tree, i=i, axis=0: jax.tree.map(lambda leaf: leaf.take(i, axis), tree)
+        assert_unbiased(pick(found, axis=1), pick(want), resolution=0.2, name=name)
 
 
 def test_third_derivatives():
     case = CASES["half-space"]
     third = lambda g: jax.jacfwd(jax.hessian(g))
     theta, sigma = jnp.array(case.theta), jnp.array(case.sigma)
-    g = lambda sigma: sd.smooth(case.fun, sigma, **PLAIN, num_samples=64)
-    run = jax.jit(jax.vmap(lambda k: third(lambda t: g(sigma)(k, t))(theta)))
-    exact = third(lambda t: case.smoothed(t, sigma))(theta)
-    assert_unbiased(run(keys(8192)), exact, resolution=0.08)
+    g = sd.smooth(case.fun, sigma, **PLAIN, num_samples=64)
+    found = for_keys(8192, lambda k: third(lambda t: g(k, t))(theta))
+    exact = jax.jit(third(lambda t: case.smoothed(t, sigma)))(theta)
+    assert_unbiased(found, exact, resolution=0.08)
 
 
-@pytest.mark.parametrize("baseline", ["none", "mean", "center"])
-def test_weighted_samples_are_unbiased(baseline):
-    theta, sigma = jnp.array(CASES["boxes"].theta), jnp.array(CASES["boxes"].sigma)
-    options: dict[str, Any] = {"sampler": Widened(), "baseline": baseline, "num_samples": 65}
-    found = estimates(derivatives, boxes, 8192, **options)(theta, sigma)
-    assert_unbiased(found, derivatives(smoothed_boxes)(theta, sigma), resolution=0.1)
+def test_weighted_samples_are_unbiased():
+    at = jnp.array([*CASES["boxes"].theta, *CASES["boxes"].sigma])
+    names = ("none", "mean", "center")
+    options: dict[str, Any] = {"sampler": Widened(), "num_samples": 65}
+
+    def estimate(key):
+        g = lambda at: sd.smooth(boxes, at[2:], baseline=Several(*names), **options)(key, at[:2])
+        return taylor(g)(at)
+
+    found = for_keys(8192, estimate)
+    exact = jax.jit(taylor(lambda at: smoothed_boxes(at[:2], at[2:])))(at)
+    for name in names:
+        own = tuple(part[name] for part in found)
+        assert_unbiased(own, exact, resolution=0.1, name=name)
 
 
 @pytest.mark.parametrize("antithetic", [False, True])
-@pytest.mark.parametrize("baseline", ["none", "mean", "center"])
-def test_unbiased_at_every_number_of_samples(antithetic, baseline):
+@pytest.mark.parametrize(
+    "num_samples",
+    [2, pytest.param(4, marks=pytest.mark.slow), 8, pytest.param(64, marks=pytest.mark.slow)],
+)
+def test_unbiased_at_every_number_of_samples(num_samples, antithetic):
     fun = lambda x: x**3 + 2 * (x > 0).astype(x.dtype)
-
-    def smoothed(theta, sigma):
-        return theta**3 + 3 * theta * sigma**2 + 2 * smoothed_step(theta[None], sigma[None])
-
-    def first_two(key, num):
-        options: dict[str, Any] = {
-            "num_samples": num + (baseline == "center"),
-            "baseline": baseline,
-            "sampler": sd.Gaussian(antithetic=antithetic),
-        }
-        model = sd.smooth_quadratic(fun, 0.5, **options)(key, theta)
-        return model.value, model.grad, model.hessian.as_matrix()[0, 0]
-
+    names = ("none", "mean", "center")
+    options: dict[str, Any] = {
+        "num_samples": num_samples + 1,  # one of them is the center
+        "sampler": sd.Gaussian(antithetic=antithetic),
+    }
+    g = sd.smooth(fun, 0.5, baseline=Several(*names), **options)
     theta = jnp.array(0.7)
-    at = (theta, jnp.array(0.5))
-    exact = smoothed(*at), jax.grad(smoothed)(*at), jax.hessian(smoothed)(*at)
-    for num in (2, 4, 8, 64):
-        found = jax.jit(jax.vmap(lambda key, num=num: first_two(key, num)))(keys(2**18 // num))
-        assert_unbiased(found, exact, resolution=0.04)
+    found = for_keys(2**18 // num_samples, lambda key: taylor(lambda x: g(key, x))(theta))
+
+    def smoothed(theta):
+        return theta**3 + 3 * theta / 4 + 2 * smoothed_step(theta[None], jnp.array([0.5]))
+
+    exact = jax.jit(taylor(smoothed))(theta)
+    for name in names:
+        own = tuple(part[name] for part in found)
+        assert_unbiased(own, exact, resolution=0.04, name=name)
 
 
 def test_a_sigma_for_each_leaf_can_be_differentiated():
@@ -111,31 +126,29 @@ def test_a_sigma_for_each_leaf_can_be_differentiated():
         square = jnp.sum(p["a"] ** 2) + 2 * s["a"] ** 2
         return square * p["b"] + smoothed_step(p["b"][None], s["b"][None])
 
-    second = lambda g: jax.hessian(g, 1)
     p = {"a": jnp.array([0.5, -1.0]), "b": jnp.array(0.4)}
     s = {"a": jnp.array(0.6), "b": jnp.array(0.8)}
-    found = estimates(second, fun, 1024, **PLAIN, num_samples=512)(p, s)
+    estimate = lambda key: jax.hessian(
+        lambda s: sd.smooth(fun, s, **PLAIN, num_samples=512)(key, p)
+    )(s)
+    found, exact = for_keys(1024, estimate), jax.jit(jax.hessian(smoothed, 1))(p, s)
     # leaf (b, a) is zero: hold all leaves to the size of the largest
-    pack = lambda tree, axis: jnp.stack(jax.tree.leaves(tree), axis)
-    assert_unbiased(pack(found, 1), pack(second(smoothed)(p, s), 0), resolution=0.2)
+    pack = lambda tree, axis: np.stack(jax.tree.leaves(tree), axis)
+    assert_unbiased(pack(found, 1), pack(exact, 0), resolution=0.2)
 
 
 def test_mixed_derivative_keeps_the_variance_reduction():
     """d2/dx dc of c^2 step(x) + 100 c: the offset 100 in d/dc is what a baseline must remove."""
     fun = lambda x, c: c**2 * step(x) + 100 * c
     theta, sigma, c = jnp.array([0.2]), 0.5, jnp.array(1.5)
-
-    def mixed(g):
-        return lambda x, c: jax.jacfwd(jax.grad(g), 1)(x, c)
-
-    exact = mixed(lambda x, c: c**2 * smoothed_step(x, jnp.array([sigma])))(theta, c)
-    spread = {}
-    for baseline in ("none", "mean", "center"):
-        g = sd.smooth(fun, sigma, baseline=baseline, num_samples=257, sampler=sd.Gaussian())
-        run = jax.jit(jax.vmap(lambda k, g=g: mixed(lambda x, c: g(k, x, c))(theta, c)))
-        found = run(keys(1024))
-        assert_unbiased(found, exact, resolution=0.2)
-        spread[baseline] = float(jnp.std(found))
+    mixed = lambda g: jax.jacfwd(jax.jacrev(g), 1)(theta, c)
+    names = ("none", "mean", "center")
+    g = sd.smooth(fun, sigma, baseline=Several(*names), num_samples=257, sampler=sd.Gaussian())
+    found = for_keys(1024, lambda k: mixed(lambda x, c: g(k, x, c)))
+    exact = jax.jit(lambda: mixed(lambda x, c: c**2 * smoothed_step(x, jnp.array([sigma]))))()
+    for name in names:
+        assert_unbiased(found[name], exact, resolution=0.2, name=name)
+    spread = {name: np.std(found[name]) for name in names}
     assert spread["mean"] < spread["none"] / 30
     assert spread["center"] < spread["none"] / 30
 
@@ -144,31 +157,43 @@ def test_mixed_derivative_keeps_the_variance_reduction():
 # the formulas, summed by hand
 
 
-@pytest.mark.parametrize("antithetic", [False, True])
-@pytest.mark.parametrize("baseline", ["none", "mean", "center"])
+@pytest.mark.parametrize(
+    ("baseline", "antithetic"),
+    [
+        ("none", False),
+        ("mean", False),
+        ("mean", True),
+        ("center", True),
+        pytest.param("none", True, marks=pytest.mark.slow),
+        pytest.param("center", False, marks=pytest.mark.slow),
+    ],
+)
 def test_estimates_are_the_published_sums(antithetic, baseline, key, x64):
     """Value, gradient (eq. 17) and Hessian (eq. 20) from the points that the function saw."""
     theta, sigma, num = jnp.array([0.3, -0.2]), np.array([0.5, 2.0]), 12
-    fun = lambda x: (boxes(x) + jnp.sum(x**3), x)
+    fun = lambda x: (boxes(x) + jnp.sum(x**3), (x, boxes(x) + jnp.sum(x**3)))
     options: dict[str, Any] = {
         "num_samples": num + (baseline == "center"),
         "baseline": baseline,
         "sampler": sd.Gaussian(antithetic=antithetic),
         "has_aux": True,
     }
-    first = jax.jit(sd.smooth_value_and_grad(fun, sigma, **options))
-    second = jax.jit(sd.smooth_hessian(fun, sigma, **options))
-    ((value, points), grad), (hessian, same_points) = first(key, theta), second(key, theta)
+    first, second = (
+        transform(fun, sigma, **options)
+        for transform in (sd.smooth_value_and_grad, sd.smooth_hessian)
+    )
+    run = jax.jit(lambda: (first(key, theta), second(key, theta), fun(theta)[0]))
+    ((value, (points, f)), grad), (hessian, (same_points, _)), center = run()
     np.testing.assert_array_equal(points, same_points)
     z = (np.asarray(points) - np.asarray(theta)) / sigma
     if antithetic:
         np.testing.assert_allclose(z[::2], -z[1::2], atol=1e-14)
-    f = np.asarray(jax.vmap(fun)(points)[0])
+    f = np.asarray(f)
     group = np.arange(num) // (2 if antithetic else 1)
     b = {
         "none": np.zeros(num),
         "mean": np.array([f[group != i].mean() for i in group]),
-        "center": np.full(num, fun(theta)[0]),
+        "center": np.full(num, center),
     }[baseline]
     outer = z[:, :, None] * z[:, None, :] - np.eye(2)
     np.testing.assert_allclose(value, f.mean(), rtol=1e-12)
@@ -183,6 +208,14 @@ def test_estimates_are_the_published_sums(antithetic, baseline, key, x64):
 PAIRS = sd.Gaussian(antithetic=True)
 AGREE = {
     "plain": ("float32", {}),
+    "center of pairs, bounds": (
+        "float64",
+        {"sampler": PAIRS, "baseline": "center", "num_samples": 25, "bounds": (-0.3, 0.5)},
+    ),
+    "weighted, drop": ("float32", {"sampler": Widened(), "nonfinite": "drop"}),
+}
+ALSO_AGREE = {
+    "plain in double precision": ("float64", {}),
     "pairs": ("float64", {"sampler": PAIRS}),
     "none": ("float32", {"baseline": "none"}),
     "center": ("float64", {"sampler": PAIRS, "baseline": "center", "num_samples": 25}),
@@ -193,7 +226,12 @@ AGREE = {
 }
 
 
-@pytest.mark.parametrize(("dtype", "changes"), AGREE.values(), ids=AGREE, indirect=["dtype"])
+@pytest.mark.parametrize(
+    ("dtype", "changes"),
+    [pytest.param(*case, id=name) for name, case in AGREE.items()]
+    + [pytest.param(*c, id=name, marks=pytest.mark.slow) for name, c in ALSO_AGREE.items()],
+    indirect=["dtype"],
+)
 def test_transforms_agree_with_ad_of_smooth(changes, dtype, key):
     options: dict[str, Any] = {**PLAIN, "num_samples": 24, **changes}
 
@@ -265,12 +303,16 @@ def test_jacobian_of_pytree_outputs_is_that_of_ad(wide, key, x64):
     p = {"a": jnp.linspace(0.0, 1.0, 20 if wide else 2), "b": jnp.array(0.3)}
     s = {"a": 0.5, "b": jnp.array(0.25)}
     options: dict[str, Any] = {**PLAIN, "num_samples": 32}
-    want = jax.jit(jax.jacrev(sd.smooth(image, s, **options), argnums=1))(key, p)
-    found = jax.jit(sd.smooth_jacobian(image, s, **options))(key, p)
+
+    @jax.jit
+    def run(p):
+        errors = sd.smooth_jacobian(image, s, **options, stderr=True)(key, p)
+        by_ad = jax.jacrev(sd.smooth(image, s, **options), argnums=1)(key, p)
+        return by_ad, sd.smooth_jacobian(image, s, **options)(key, p), errors
+
+    want, found, (estimate, error) = run(p)
     assert found["pixels"]["a"].shape == (2, 3, p["a"].size)
     assert_same(found, want, np.float64)
-    errors = sd.smooth_jacobian(image, s, **options, stderr=True)
-    estimate, error = jax.jit(errors)(key, p)
     assert_same(estimate, want, np.float64)
     assert jax.tree.map(jnp.shape, error) == jax.tree.map(jnp.shape, want)
 

@@ -1,27 +1,17 @@
 """The benchmark of errors: its truth is true, it runs, resumes, compares, and shows results."""
 
 import json
-from typing import Any
+from argparse import Namespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rich.console import Console
 
-from benchmarks import variance
-from benchmarks.variance import compare, descent, estimators, measure, replicates, tables
-from benchmarks.variance.problems import PROBLEMS
-
-TINY = variance.Setting(
-    name="tiny",
-    problems=("quad",),
-    estimators=("sobol-mean", "fr22"),
-    samples=(8,),
-    repeats={"quad": 3},
-    grid=descent.Grid((2,), ("pairs",), (0.03,), ((0.8, 0.95),)),
-    costs=False,
-)
+from benchmarks import _study
+from benchmarks.studies import variance
+from benchmarks.studies.variance import descent, errors, estimators, fits, replicates, targets
+from benchmarks.studies.variance.problems import PROBLEMS
 
 
 @pytest.fixture(autouse=True)
@@ -33,10 +23,43 @@ def standard_promotion():
 
 def row(squares, evaluations=64):
     squares = np.asarray(squares, float)
-    return measure.Row(evaluations, squares, np.ones_like(squares), np.full(len(squares), 1e-3))
+    return errors.Row(evaluations, squares, np.ones_like(squares), np.full(len(squares), 1e-3))
 
 
-@pytest.mark.parametrize("name", ["quad", "box10", "texture"])
+def curve(level):
+    """Errors that fall with the number of evaluations."""
+    rmse = lambda num: [0.9 * level / num, level / num, 1.1 * level / num]
+    return {str(n): {"evaluations": n, "rmse": rmse(n), "ms": 0.5} for n in (64, 256, 1024)}
+
+
+def results():
+    """As of a full run, in which the published sampler errs ten times as much as ours."""
+    problems = {
+        problem: {
+            "title": problem,
+            "repeats": 2,
+            "estimators": {
+                name: {"title": estimator.title}
+                | {
+                    q: curve(10 if name == "aggregate" else 1)
+                    for q in PROBLEMS[problem]().quantities
+                }
+                for name, estimator in estimators.ANYWHERE.items()
+            },
+        }
+        for problem in ("box2", "box10")
+    }
+    fading = {"evaluations": [2, 4], "error": [[1, 0.1], [1, 0.2], [1, 0.3]]}
+    return {
+        "problems": problems,
+        "targets": [{"problem": "box2", "aggregate": [9.0, 10.0, 11.0], "aggregate, goal": 3}],
+        "descent": [{"credit": "local", "to 99 %": [212.0, 244.0, None], "curve": fading}],
+        "replicates": [{"baseline": "mean", "sets": 4, "coverage": [0.93, 0.96, 0.98]}],
+        "fits": [{"N": 1024, "gradient, gp": 12.34, "gradient pays from, us": None}],
+    }
+
+
+@pytest.mark.parametrize("name", ["box10", "texture"])
 def test_the_closed_form_is_the_mean_of_the_function(name):
     problem, num = PROBLEMS[name](), 1024
     y = problem.position(jax.random.key(7))
@@ -57,91 +80,90 @@ def test_terms_add_up_and_the_support_covers_them():
     assert not jnp.any(moved & (reach == 0))
 
 
-def test_runs_writes_and_resumes(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(descent, "BUDGETS", {"local": 4, "scalar": 4})
-    variance.main(tmp_path, TINY, command="a test")
-    assert "Quad" in capsys.readouterr().out
-    results = json.loads((tmp_path / "results.json").read_text())
-    found = results["problems"]["quad"]["estimators"]
-    assert found["fr22"]["gradient"]["evaluations"] == [8]
-    low, middle, high = found["sobol-mean"]["hvp"]["rmse"][0]
-    assert 0 < low <= middle <= high
-    for picture in ("quad.png", "descent.png"):
-        assert (tmp_path / picture).read_bytes().startswith(b"\x89PNG")
-
-    def measure_again(*_):
-        raise AssertionError("measured again")
-
-    monkeypatch.setattr(measure, "_measure", measure_again)
-    case = measure.case("quad", 3)
-    sobol = estimators.ESTIMATORS["sobol-mean"]
-    again = measure.rows(case, "sobol-mean", sobol, 8, tmp_path / "runs")
-    assert measure.relative_rmse(again["hvp"])[1] == pytest.approx(middle, rel=1e-3)
-    with pytest.raises(AssertionError, match="measured again"):  # another estimator by that name
-        measure.rows(case, "sobol-mean", estimators.ESTIMATORS["sobol"], 8, tmp_path / "runs")
-
-
 def test_evaluations_are_at_most_what_is_asked_for():
-    for problem in (PROBLEMS["box10"](), PROBLEMS["texture"]()):
-        for estimator in estimators.estimators_for(problem.name).values():
-            for part in estimator.parts(problem, 250):
+    for name in ("box10", "texture"):
+        for estimator in estimators.ESTIMATORS[name].values():
+            for part in estimator.parts(PROBLEMS[name](), 250):
                 assert 0 < part.evaluations <= 250
 
 
 def test_ratios_compare_the_same_positions():
-    low, middle, high = measure.ratio(row([1, 4, 9]), row([4, 16, 36]))
+    low, middle, high = errors.ratio(row([1, 4, 9]), row([4, 16, 36]))
     assert (low, middle, high) == pytest.approx((2, 2, 2))
-    assert measure.relative_rmse(row([4, 4, 4]))[1] == 2
+    assert errors.relative_rmse(row([4, 4, 4]))[1] == 2
 
 
-def test_targets_ingredients_and_thresholds(capsys):
-    names = (compare.OURS, *compare.OPPONENTS, "sobol-mean", "sobol-gp")
-    levels = (1, 100, 25, 16, 4, 1)
-    errors = {name: [level, 2 * level] for name, level in zip(names, levels, strict=True)}
-
-    def by_num(squares):
-        return {
-            num: {q: row(np.array(squares) / num**2, num) for q in ("gradient", "hessian")}
-            for num in (64, 256)
-        }
-
-    measured: compare.Measured = {
-        "box2": {name: by_num(squares) for name, squares in errors.items()}
-    }
-
-    targets = compare.against_targets(measured)
-    assert len(targets) == 4  # gradient and Hessian at two of three N, of one of two problems
-    assert [over["ratio"][1] for over in targets[0]["over"].values()] == pytest.approx([10, 5, 4])
-    assert targets[0]["over"][compare.PUBLISHED]["target"] == 3
-    given = compare.ingredients(measured)["box2"]
-    assert given["sobol-mean"]["hessian"][256] == pytest.approx(5)
-
-    # errors that fall with N and are halved by the fit spare as many evaluations again
-    ms = {f"{q}, {b}": t for q in ("gradient", "hessian") for b, t in (("mean", 1.0), ("gp", 1.64))}
-    fit: dict[str, Any] = {"samples": 64, "ms": ms}
-    fit["pays_from_us"] = compare.pays_from_us(measured["box2"], fit)
-    assert fit["pays_from_us"]["gradient"] == pytest.approx(10, rel=1e-3)
-
-    written = json.loads(json.dumps(given))
-    for shown, text in (
-        (tables._targets(targets), "10.0 [10.0, 10.0] / 3"),
-        (tables._ingredients({"box2": written}), "Sobol, mean"),
-        (tables._fits([fit]), "10 us"),
-    ):
-        Console(width=180).print(shown)
-        assert text in capsys.readouterr().out
+def test_targets_are_compared_with_their_opponents(monkeypatch):
+    goals = {("box2", "hessian", 64): {"aggregate": 3}}
+    monkeypatch.setattr(targets, "TARGETS", goals)
+    levels = {"ours": 1, "aggregate": 100, "aggregate-mean": 25, "optax": 16}
+    measured = {n: {"hessian": {64: row([x, 2 * x])}} for n, x in levels.items()}
+    (line,) = targets.against_targets({"box2": measured})
+    assert [line[name][1] for name in ("aggregate", "aggregate-mean", "optax")] == [10, 5, 4]
+    assert (line["aggregate, goal"], line["optax, goal"]) == (3, None)
 
 
-def test_replicates_cost_and_cover(monkeypatch):
-    monkeypatch.setattr(replicates, "REPLICATES", (1, 2))
-    monkeypatch.setattr(replicates, "BASELINES", ("mean",))
-    one, two = replicates.run(measure.case("quad", 3), 16)
-    assert one["rmse_over_one_set"] == pytest.approx([1, 1, 1])
-    assert two["sets"] == 2
-    assert 0 <= two["coverage"][1] <= 1
-    assert two["half_width_over_rmse"] > 1
+def test_a_fit_pays_where_it_takes_less_time_than_the_evaluations_it_spares():
+    plain, fitted = ({"gradient": {int(n): at for n, at in curve(x).items()}} for x in (1, 0.5))
+    found = {"sobol-mean": plain, "sobol-gp": fitted}
+    ms = {"gradient, mean": 1.0, "gradient, gp": 1.64}
+    assert fits.pays_from(found, ms, 64, "gradient") == pytest.approx(10)
+    assert fits.pays_from(found | {"sobol-gp": plain}, ms, 64, "gradient") is None
 
 
 def test_costs_to_a_level():
-    curve = np.array([[1.0, 0.5, 0.05], [1.0, 0.5, 0.4]])
-    assert descent.costs(curve, 4, 0.1).tolist() == [12.0, np.inf]
+    curves = np.array([[1.0, 0.5, 0.05], [1.0, 0.5, 0.4]])
+    assert descent.costs(curves, 4, 0.1).tolist() == [12.0, np.inf]
+
+
+def test_results_are_drawn_and_shown(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "200")
+    written = _study.write(results(), tmp_path)
+    _study.show(variance.tables(written))
+    printed = capsys.readouterr().out
+    for text in ("10 [9, 11]", "0.016/0.0039/0.00098", "244 [212, -]", "0.96 [0.93, 0.98]", "12.3"):
+        assert text in printed
+    variance.draw(written, tmp_path)
+    for name in ("box2", "box10", "ingredients", "descent"):
+        assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+def test_a_whole_study_runs_writes_and_resumes(monkeypatch, tmp_path):
+    some = {
+        name: estimators.BOXES[name] for name in ("ours", "aggregate", "sobol-mean", "sobol-gp")
+    }
+    monkeypatch.setattr(variance, "ESTIMATORS", {"box2": some, "box10": some})
+    monkeypatch.setattr(variance, "FULL", {"box2": 2, "box10": 2})
+    monkeypatch.setattr(variance, "FULL_SAMPLES", (8, 16))
+    monkeypatch.setattr(targets, "TARGETS", {})
+    short = {k: setting._replace(evaluations=8) for k, setting in descent.SETTINGS.items()}
+    monkeypatch.setattr(descent, "SETTINGS", short)
+    monkeypatch.setattr(fits, "SAMPLES", (16,))
+    monkeypatch.setattr(replicates, "SAMPLES", 16)
+    monkeypatch.setattr(replicates, "REPLICATES", (1, 2))
+    monkeypatch.setattr(replicates, "BASELINES", ("mean",))
+    options = Namespace(said="a test", full=True, fresh=False)
+    _study.run(variance, options, tmp_path)
+    results = json.loads((tmp_path / "results.json").read_text())
+    found = results["problems"]["box2"]["estimators"]
+    assert found["aggregate"]["hessian"]["8"]["evaluations"] == 8
+    low, middle, high = found["sobol-mean"]["hvp"]["8"]["rmse"]
+    assert 0 < low <= middle <= high
+    one, two = results["replicates"]
+    assert one["RMSE over one set's"] == [1, 1, 1]
+    assert two["sets"] == 2
+    assert 0 <= two["coverage"][1] <= 1
+    assert results["fits"][0]["gradient, gp"] > 0
+
+    def measure_again(*_):
+        raise AssertionError("measured again")
+
+    monkeypatch.setattr(errors, "_measure", measure_again)
+    monkeypatch.setattr(fits, "run", lambda *_: [])
+    monkeypatch.setattr(replicates, "run", lambda *_: [])
+    again = variance.measure(options, tmp_path)["problems"]["box2"]["estimators"]
+    assert again["sobol-mean"]["hvp"][8]["rmse"][1] == pytest.approx(middle, rel=1e-3)
+    options.fresh = True
+    with pytest.raises(AssertionError, match="measured again"):
+        variance.measure(options, tmp_path)

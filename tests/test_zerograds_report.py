@@ -1,23 +1,23 @@
-"""The report of ZeroGrads: it runs, counts and resumes; and its numbers are what they say."""
+"""The study of ZeroGrads: its numbers are what they say; it is shown, it runs, and it resumes."""
 
 import dataclasses
-import json
-from functools import partial
+import functools
+from argparse import Namespace
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 
 import smoothdiff as sd
-from benchmarks import zerograds
-from benchmarks._harness import Counter
-from benchmarks._task import Budget, NotAble, Task
-from benchmarks.zerograds import (
-    _configurations,
-    _loop,
-    _setting,
+from benchmarks import _registry, _study, _style
+from benchmarks._grid import to_rich
+from benchmarks._task import Budget, Problem, Score, Task, TaskEntry
+from benchmarks.studies import zerograds
+from benchmarks.studies.zerograds import (
+    _runs,
+    _solvers,
     ablations,
     control_variate,
     gradients,
@@ -27,20 +27,6 @@ from benchmarks.zerograds import (
 )
 from smoothdiff.surrogates import MLP
 
-TINY = zerograds.Setting(
-    name="tiny",
-    seeds=1,
-    budgets={"wicker": 40},
-    samples={"wicker": (4,)},
-    gradients=("wicker",),
-    gradient_seeds=1,
-    truth=64,
-    replay=("wicker",),
-    replay_seeds=1,
-    control=("wicker",),
-    repeats=4,
-)
-
 
 @pytest.fixture(autouse=True)
 def standard_promotion():
@@ -49,182 +35,122 @@ def standard_promotion():
         yield
 
 
-@pytest.fixture
-def slope() -> Task:
+def slope(full: bool = False) -> Task:
     """A linear function of two parameters, whose gradient is known and does not change."""
-
-    def loss(y):
-        return 3 * y[0] - 4 * y[1]
-
-    return Task(
-        name="slope",
-        title="A slope",
-        loss=loss,
-        exact_loss=loss,
-        start=lambda seed: jnp.asarray([1.0, 1.0]),
-        reference=jnp.zeros(2),
+    problem = Problem(
+        loss=lambda y: 3 * y[0] - 4 * y[1],
         bounds=(jnp.full(2, -50.0), jnp.full(2, 50.0)),
         sigma=0.5,
         budget=Budget(400, 100.0),
-        seeds=1,
     )
+    start = lambda seed: jnp.asarray([1.0, 1.0])
+    return Task("slope", "A slope", problem, Score(jnp.zeros(2)), start, seeds=1)
 
 
 def run_of(errors, evaluations=(0, 10, 20, 40)):
     return {"evaluations": list(evaluations), "image_error": list(errors)}
 
 
-def test_runs_writes_and_resumes(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(toy, "BUDGET", 40)
-    few = [each for each in _configurations.ablations() if each.name in ("ours", "no-smooth", "fd")]
-    monkeypatch.setattr(_configurations, "ablations", lambda: few)
-    monkeypatch.setattr(gradients, "TITLES", {"ours": "Ours"})
-    monkeypatch.setattr(control_variate, "BASELINES", {"mean": "the mean"})
-    monkeypatch.setattr(control_variate, "SHARES", (1.0,))
-    zerograds.main(tmp_path, TINY, command="a test")
-    assert "NoSmooth" in capsys.readouterr().out
-    results = json.loads((tmp_path / "results.json").read_text())
-    for part in zerograds.PARTS:
-        assert (tmp_path / f"{part}.png").read_bytes().startswith(b"\x89PNG")
-    wicker = results["ablations"]["tasks"]["wicker"]
-    assert wicker["ratios"]["ours"] == pytest.approx(1)
-    assert set(wicker["curves"]) == set(results["ablations"]["titles"])
-
-    def run_again(*_, **__):
-        raise AssertionError("run again")
-
-    for name in ("toy", "control_variate"):  # these keep nothing
-        kept = results[name]
-        monkeypatch.setattr(zerograds.PARTS[name], "measure", lambda *_, kept=kept: kept)
-    monkeypatch.setattr(_loop, "Steps", run_again)
-    monkeypatch.setattr(gradients.Descent, "__call__", run_again)
-    zerograds.main(tmp_path, TINY, command="a test")
-    assert json.loads((tmp_path / "results.json").read_text())["samples"] == results["samples"]
-    with pytest.raises(AssertionError, match="run again"):
-        zerograds.main(tmp_path, TINY, command="a test", fresh=True)
+TASK = {"parameters": 3, "evaluations": [10, 40]}
 
 
-def test_settings_name_tasks_that_are_there():
-    groups = {name for members in _configurations.GROUPS.values() for name in members}
-    for setting in (zerograds.QUICK, zerograds.FULL):
-        assert set(setting.budgets) <= groups
-        named = {*setting.samples, *setting.gradients, *setting.replay, *setting.control}
-        assert named <= set(setting.budgets)
-    assert set(zerograds.FULL.budgets) == groups
-
-
-def test_starts_of_every_study_are_what_was_asked_for():
-    setting = TINY.with_starts(3)
-    changed = {name for name in TINY._fields if getattr(setting, name) != getattr(TINY, name)}
-    assert changed == {"seeds", "gradient_seeds", "replay_seeds"}
-    assert {getattr(setting, name) for name in changed} == {3}
-
-
-def test_stretches_are_the_steps_of_minimise_and_are_counted(slope):
-    counter = Counter()
-    watched = dataclasses.replace(slope, loss=counter.watch(slope.loss))
-    ours = partial(_configurations.ours, surrogate=partial(MLP, width=4, depth=1))
-    solve = _loop.in_stretches(ours, watched)
-    ys, key = [], jax.random.key(3)
-    counts = []
-
-    def record(y):
-        ys.append(np.asarray(y))
-        counts.append(counter.evaluations)
-
-    solve(slope.start(0), key, record)
-    assert counts[-1] == slope.budget.evaluations
-    assert counts[0] == 2
-    steps = []
-    sd.minimise(
-        lambda y, args: slope.loss(y),
-        slope.start(0),
-        key=key,
-        solver=ours(slope),
-        bounds=slope.bounds,
-        max_steps=20,
-        callback=lambda step: steps.append(step.y),
-    )
-    # one step each at first
-    assert np.array(ys[:20]) == pytest.approx(np.array(steps), abs=1e-5)
-
-
-def test_ablations_are_ours_but_for_one_thing():
-    task = _setting.load("wicker", TINY)
-    ours = _configurations.ours(task)
-    assert _configurations.ours(task, inner_sigma=0.0).inner_sigma == 0
-    assert ours.local
-    assert not _configurations.ours(task, local=False).local
-    names = [method.name for method in _configurations.ablations()]
-    assert names == ["ours", *_configurations.PAPER["rendering"]]
-    sources = {method.name: method.source for method in _configurations.ablations()}
-    assert len(set(sources.values())) == len(sources)
-
-
-def test_what_is_too_large_is_not_able(slope):
-    task = dataclasses.replace(slope, reference=jnp.zeros((300, 20)))
-    assert _configurations.size(task) == 6000
-    able = {method.name: method for method in _configurations.ablations()}
-    with pytest.raises(NotAble, match="6,000 by 6,000"):
-        able["no-nn"].prepare(task)
-    with pytest.raises(NotAble, match="12,000 evaluations"):
-        able["fd"].prepare(task)
-
-
-def test_ratios_are_taken_where_ours_is_down_to_five_percent():
+def test_errors_are_compared_where_ours_is_down_to_a_twentieth():
     runs = {
-        "ours": [run_of((1, 0.4, 0.05, 0.01)), run_of((1, 0.2, 0.03, 0.0))],
+        "ours": [run_of((1, 0.5, 0.04, 0.02)), run_of((1, 0.2, 0.03, 0.0))],
         "fr22": [run_of((1, 0.8, 0.4, 0.2))] * 2,
-        "fd": NotAble("needs more"),
     }
-    found = ablations.compare(runs, 40)
+    found = ablations.compare(runs, TASK)
     assert (found["at"], found["reached"]) == (20, True)
-    assert found["ratios"] == pytest.approx({"ours": 1, "fr22": 10})
-    assert found["not_able"] == {"fd": "needs more"}
+    assert found["ratios"]["ours"] == 1
+    assert found["ratios"]["fr22"] == pytest.approx(0.4 / 0.035)
     assert found["final"]["fr22"] == 0.2
+    assert found["curves"]["ours"][1] == pytest.approx([0.35, 0.01])
 
-    found = ablations.compare({"ours": [run_of((1, 0.9, 0.8, 0.5))], "fr22": runs["fr22"]}, 40)
+    found = ablations.compare({"ours": [run_of((1, 0.9, 0.8, 0.5))], "fr22": runs["fr22"]}, TASK)
     assert (found["at"], found["reached"]) == (40, False)
     assert found["ratios"]["fr22"] == pytest.approx(0.4)
 
 
 def test_what_is_solved_counts_as_a_thousandth():
-    found = ablations.compare({"ours": [run_of((1, 0, 0, 0))], "fr22": [run_of((1, 1, 1, 1))]}, 40)
-    assert found["ratios"]["fr22"] == pytest.approx(1000)
-
-
-def test_groups_have_geometric_means():
-    tasks = {
-        "led": {"ratios": {"ours": 1.0, "fr22": 2.0}},
-        "wicker": {"ratios": {"ours": 1.0, "fr22": 8.0, "no-nn": 3.0}},
-        "mlp": {"ratios": {"ours": 1.0}},
-    }
-    found = ablations.means(tasks)
-    assert found["modelling"] == pytest.approx({"ours": 1, "fr22": 4, "no-nn": 3})
-    assert found["many parameters"] == {"ours": pytest.approx(1)}
-
-
-def test_samples_are_compared_at_the_end():
-    runs = {2: [run_of((1, 0.5, 0.3, 0.1))], 4: [run_of((1, 0.6, 0.4, 0.2))]}
-    found = samples.compare(runs, 40)
-    assert found["samples"] == [2, 4]
-    assert [each[1] for each in found["errors"]] == [0.1, 0.2]
+    runs = {"ours": [run_of((1, 0, 0, 0))], "fr22": [run_of((1, 1, 1, 1))]}
+    assert ablations.compare(runs, TASK)["ratios"]["fr22"] == pytest.approx(1000)
 
 
 def test_replay_is_read_where_the_error_is_down_to_a_tenth():
     runs = [run_of((1, 0.5, 0.1, 0.02)), run_of((1, 0.09, 0.05, 0.01)), run_of((1, 1, 1, 0.9))]
-    found = replay.compare(runs, np.array([10, 40]))
+    found = replay.compare(runs, [10, 40])
     assert found["took"] == {"median": 20, "lower": 20, "upper": None}
     assert found["final"]["median"] == 0.02
     assert found["curves"][1] == pytest.approx([0.5, 0.02])
 
 
-def test_the_control_variate_is_what_the_run_has_learnt(slope):
-    # a gp knows a slope from its samples; without one, all variance is what the surrogate leaves
-    ratios = control_variate.along(slope, seed=0, repeats=20)
-    assert len(ratios["mean"]) == len(ratios["gp"]) == len(control_variate.SHARES)
-    assert ratios["mean"][-1] > 10
-    assert ratios["mean"][-1] > ratios["mean"][0]
+def test_all_parts_are_drawn_and_shown(monkeypatch, tmp_path):
+    monkeypatch.setitem(_style.STYLE, "savefig.dpi", 20)
+    runs = [run_of((1, 0.5, 0.1, 0.02))]
+    row = {name: [[1, 0, 1, 1], [2, 3, 2, 2], [2, 4, 2, 2]] for name in gradients.ROWS}
+    along, line = {"evaluations": [5, 15, 25, 35]}, row["cosine"]
+    of_replay = {name: replay.compare(runs, TASK["evaluations"]) for name in replay.TITLES}
+    frame = {"share": 0.5, "y": 0.3, "loss": 0.4, "sigma": 0.1, "smoothed": 0.35}
+    frame |= {"evaluations": 80, "samples": [0.2, 0.4], "surrogate": [0.5, 0.3, 0.1]}
+    parts = {
+        "toy": {"reference": 0.75, "frames": [frame, frame | {"share": 1}]},
+        "ablations": {"tasks": {"led": ablations.compare({"ours": runs, "fr22": runs}, TASK)}},
+        "gradients": {"tasks": {"led": along | dict.fromkeys(gradients.TITLES, row)}},
+        "samples": {
+            "tasks": {
+                "led": {"evaluations": 40, "samples": [2, 4], "errors": [[0, 0.1, 0.2]] * 2},
+                "wicker": {"evaluations": 40, "samples": [8], "errors": [[0.1, 0.1, 0.2]]},
+            }
+        },
+        "replay": {"tasks": {"led": TASK | of_replay}},
+        "control_variate": {
+            "samples": 4,
+            "repeats": 8,
+            "tasks": {"led": along | dict.fromkeys(control_variate.BASELINES, line)},
+        },
+    }
+    assert set(parts) == set(zerograds.PARTS)
+    results = _study.rounded({name: {"starts": 2} | part for name, part in parts.items()})
+    zerograds.draw(results, tmp_path)
+    for name in parts:
+        assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    shown = {grid.title.split(":")[0]: grid for grid in zerograds.tables(results)}
+    for grid in shown.values():
+        assert to_rich(grid).row_count == len(grid.rows) > 0
+        assert all(len(row.cells) == len(grid.columns) - 1 for row in grid.rows)
+    left = shown["Error that is left, in %, by the number of samples in a step"]
+    assert [row.cells for row in left.rows] == [("40", "10", "10", ""), ("40", "", "", "10")]
+    assert shown["Toy"].rows[0] == ("50%", ("80", "0.300", "0.400", "0.350"), None, False, False)
+
+
+def test_the_parts_are_of_tasks_that_are_there():
+    assert set(_runs.BUDGETS) <= set(_registry.tasks())
+    named = {*samples.NUMBERS, *gradients.TASKS, *replay.TASKS, *control_variate.TASKS}
+    assert named <= set(_runs.BUDGETS)
+    task = _runs.load("wicker")
+    assert (task.name, task.problem.budget.evaluations) == ("wicker", 600)
+    assert _runs.about(task)["parameters"] == 3
+    assert len(_runs.about(task)["evaluations"]) <= 40
+
+
+def test_starts_of_every_part_are_what_was_asked_for(monkeypatch, tmp_path):
+    part = SimpleNamespace(measure=lambda starts, folder, fresh: {"runs": (starts, fresh)})
+    monkeypatch.setattr(zerograds, "PARTS", {"one": part, "other": part})
+    for seeds, starts in ((3, 3), (None, zerograds.SEEDS)):
+        found = zerograds.measure(Namespace(seeds=seeds, fresh=True), tmp_path)
+        each = {"starts": starts, "runs": (starts, True)}
+        assert found == {"one": each, "other": each}
+
+
+def test_ablations_are_ours_with_one_setting_changed():
+    usual = _solvers.ours(slope().problem)
+    for name, changes in ablations.CHANGES.items():
+        solver = _solvers.ours(slope().problem, **changes)
+        for setting in ("inner_sigma", "surrogate", "local", "num_samples", "replay"):
+            assert getattr(solver, setting) == changes.get(setting, getattr(usual, setting)), name
+    methods = ablations.methods()
+    assert [method.name for method in methods] == [*ablations.CHANGES, "fd", "fr22"]
+    assert len({method.source for method in methods}) == len(methods)
 
 
 def test_signs_are_directions_of_unit_variance(key):
@@ -242,10 +168,39 @@ def test_kept_gradient_changes_nothing():
     assert updates is state is grad
 
 
+@pytest.mark.slow
+def test_true_gradients_by_values_and_terms_agree(monkeypatch, key):
+    monkeypatch.setattr(gradients, "BATCH", None)
+    problem = slope().problem
+    by_terms = dataclasses.replace(
+        problem, terms=lambda y: y * jnp.asarray([3.0, -4.0]), support=lambda y: y
+    )
+    for each in (problem, by_terms):
+        truth = gradients._true_gradient(each)(key, jnp.ones(2), jnp.asarray(0.5))
+        assert np.asarray(truth) == pytest.approx([3, -4], abs=0.3)
+
+
+def test_the_toy_is_smoothed():
+    y = np.array([0.3, 0.75])
+    draws = np.random.default_rng(0).normal(size=200_000)
+    for at, smooth in zip(y, toy.smoothed(y, 0.1), strict=True):
+        values = toy.loss(np.clip(at + 0.1 * draws, 0, 1))
+        assert abs(values.mean() - smooth) < 4 * values.std() / len(draws) ** 0.5 + 1e-3
+
+
+@pytest.mark.slow
+def test_the_toy_is_solved(tmp_path):
+    frames = toy.measure(1, tmp_path, False)["frames"]
+    assert [frame["evaluations"] for frame in frames] == [0, 80, 280, 800]
+    assert frames[-1]["loss"] == 0
+    assert frames[1]["surrogate"][0] > frames[1]["surrogate"][-1]  # it leads towards the reference
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", gradients.TITLES)
-def test_on_a_slope_gradients_point_the_right_way(name, slope):
-    found = gradients.Descent(name, slope, 2048)(seed=0)
-    assert len(found["cosine"]) == gradients.WINDOWS
+def test_on_a_slope_gradients_point_the_right_way(name):
+    found = gradients.following(name, slope())(0)
+    assert {len(values) for values in found.values()} == {gradients.WINDOWS}
     if name == "ours":  # it has learnt the slope
         assert np.median(found["cosine"]) > 0.97
     else:  # a random diagonal
@@ -256,31 +211,50 @@ def test_on_a_slope_gradients_point_the_right_way(name, slope):
         assert np.median(found["variance"]) == pytest.approx(lengths.var(), rel=0.7)
 
 
-def test_true_gradients_by_values_terms_and_ad_agree(slope, key):
-    by_ad = dataclasses.replace(slope, name=gradients.SMOOTH[0])
-    terms, support = lambda y: y * jnp.asarray([3.0, -4.0]), lambda y: y
-    by_terms = dataclasses.replace(slope, terms=terms, support=support)
-    for task in (slope, by_ad, by_terms):
-        truth = gradients._true_gradient(task, 4096)(key, slope.start(0), jnp.asarray(0.5))
-        assert np.asarray(truth) == pytest.approx([3, -4], abs=0.3)
+@pytest.fixture
+def of_slope(monkeypatch):
+    """Makes the slope the only task of all parts, for so many evaluations."""
+
+    def only(evaluations):
+        monkeypatch.setattr(_registry, "task", lambda name: TaskEntry("A slope", "program", slope))
+        for name in list(_runs.BUDGETS):
+            monkeypatch.delitem(_runs.BUDGETS, name)
+        monkeypatch.setitem(_runs.BUDGETS, "slope", evaluations)
+        for part in (gradients, replay, control_variate):
+            monkeypatch.setattr(part, "TASKS", ("slope",))
+
+    return only
 
 
-def test_the_toy_is_smoothed_and_solved():
-    y = np.array([0.3, 0.75])
-    draws = np.random.default_rng(0).normal(size=200_000)
-    for at, smooth in zip(y, toy.smoothed(y, 0.1), strict=True):
-        values = toy.loss(np.clip(at + 0.1 * draws, 0, 1))
-        assert abs(values.mean() - smooth) < 4 * values.std() / len(draws) ** 0.5 + 1e-3
-    frames = toy.measure(TINY, None, False)["frames"]  # type: ignore[arg-type]
-    assert [frame["evaluations"] for frame in frames] == [0, 80, 280, 800]
-    assert frames[-1]["loss"] == 0
-    assert frames[1]["surrogate"][0] > frames[1]["surrogate"][-1]  # it leads towards the reference
+@pytest.mark.slow
+def test_the_control_variate_is_what_the_run_has_learnt(monkeypatch, of_slope, tmp_path):
+    # a gp knows a slope from its samples; without one, all variance is what the surrogate leaves
+    of_slope(400)
+    monkeypatch.setattr(control_variate, "REPEATS", 20)
+    ratios = control_variate.measure(1, tmp_path, False)["tasks"]["slope"]
+    assert len(ratios["mean"][1]) == len(ratios["gp"][1]) == len(control_variate.SHARES)
+    assert ratios["mean"][1][-1] > 10
+    assert ratios["mean"][1][-1] > ratios["mean"][1][0]
 
 
-def test_optimisers_are_chained_after_what_keeps_the_gradient():
-    task = _setting.load("wicker", TINY)
-    for name in gradients.TITLES:
-        steps = _loop.Steps(gradients.solver(name, task), task)
-        state = jax.eval_shape(steps.init, task.start(0), jax.random.key(0))
-        assert state.opt_state[0].shape == (3,)
-    assert isinstance(gradients.kept_gradient(), optax.GradientTransformation)
+@pytest.mark.slow
+def test_it_runs_and_resumes(monkeypatch, of_slope, tmp_path):
+    of_slope(40)
+    small = {"surrogate": functools.partial(MLP, width=8, depth=1), "surrogate_steps": 1}
+    monkeypatch.setattr(sd, "ZeroGrads", functools.partial(sd.ZeroGrads, **small))
+    parts = {"ablations": ablations, "gradients": gradients, "samples": samples, "replay": replay}
+    monkeypatch.setattr(zerograds, "PARTS", parts)
+    monkeypatch.setattr(ablations, "methods", lambda: [_solvers.configuration("ours")])
+    monkeypatch.setattr(gradients, "TITLES", {"fr22": "FR22"})
+    monkeypatch.setattr(samples, "NUMBERS", {"slope": (4,)})
+    monkeypatch.setattr(replay, "TITLES", {"0": "none"})
+    _study.run(zerograds, Namespace(said="a test", seeds=1, fresh=False), tmp_path)
+    assert {path.stem for path in tmp_path.glob("*.png")} == set(parts)
+
+    files = lambda: {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npz")}
+    kept = files()
+    assert len(kept) == 4  # one of each part
+    first = {part: part.measure(1, tmp_path / "runs", False) for part in (samples, gradients)}
+    assert files() == kept
+    assert gradients.measure(1, tmp_path / "runs", True) == first[gradients]
+    assert {path.name for path in kept if files()[path] != kept[path]} == {"gradient-fr22-0.npz"}
