@@ -40,8 +40,8 @@ class Aggregate(PointSampler):
         >>> import jax, jax.numpy as jnp, smoothdiff as sd
         >>> f = lambda x: jnp.floor(jnp.sum(x))
         >>> g = sd.smooth_hessian(f, 1.0, sampler=sd.Aggregate(2), num_samples=64)
-        >>> g(jax.random.key(0), jnp.zeros(3)).shape
-        (3, 3)
+        >>> g(jax.random.key(0), jnp.zeros(2)).shape
+        (2, 2)
 
     Source: Stochastic Gradient Estimation for Higher-order Differentiable Rendering, section 3.5.
     """

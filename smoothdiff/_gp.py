@@ -77,8 +77,8 @@ class GaussianProcess(AbstractBaseline):
         >>> import jax, jax.numpy as jnp, smoothdiff as sd
         >>> f = lambda x: jnp.floor(jnp.sum(x**2))
         >>> g = sd.smooth_grad(f, 0.5, baseline=sd.GaussianProcess(), num_samples=64)
-        >>> g(jax.random.key(0), jnp.ones(3)).shape
-        (3,)
+        >>> g(jax.random.key(0), jnp.ones(2)).shape
+        (2,)
 
     Source: own; the idea is Bayesian quadrature (O'Hagan, 1991) and control functionals (Oates,
     Girolami and Chopin, 2017), with a Gaussian measure and its derivatives.

@@ -51,7 +51,7 @@ def smooth(call: Call) -> Callable:
     Example:
         >>> import jax, jax.numpy as jnp, smoothdiff as sd
         >>> step = lambda x: jnp.where(x > 0, 1.0, 0.0)
-        >>> g = sd.smooth(step, 0.5, num_samples=10_000)
+        >>> g = sd.smooth(step, 0.5, num_samples=4096)
         >>> print(f"{jax.grad(g, argnums=1)(jax.random.key(0), 0.0):.1f}")  # normal density
         0.8
 

@@ -38,8 +38,8 @@ def smooth_hessian(call: Call) -> Callable:
     Example:
         >>> import jax, jax.numpy as jnp, smoothdiff as sd
         >>> f = lambda x: jnp.sum(jnp.round(x)) ** 2
-        >>> sd.smooth_hessian(f, 0.5)(jax.random.key(0), jnp.ones(3)).shape
-        (3, 3)
+        >>> sd.smooth_hessian(f, 0.5)(jax.random.key(0), jnp.ones(2)).shape
+        (2, 2)
 
     Source: Stochastic Gradient Estimation for Higher-order Differentiable Rendering, eq. 20.
     """
@@ -101,9 +101,9 @@ def smooth_hvp(call: Call) -> Callable:
     Example:
         >>> import jax, jax.numpy as jnp, smoothdiff as sd
         >>> f = lambda x: jnp.sum(jnp.round(x)) ** 2
-        >>> x = jnp.ones(3)
+        >>> x = jnp.ones(2)
         >>> sd.smooth_hvp(f, 0.5)(jax.random.key(0), x, x).shape
-        (3,)
+        (2,)
 
     Source: Stochastic Gradient Estimation for Higher-order Differentiable Rendering, eq. 22.
     """
@@ -151,9 +151,9 @@ def smooth_quadratic(call: Call) -> Callable:
     Example:
         >>> import jax, jax.numpy as jnp, smoothdiff as sd
         >>> f = lambda x: jnp.sum(jnp.round(x)) ** 2
-        >>> model = sd.smooth_quadratic(f, 0.5)(jax.random.key(0), jnp.ones(3))
+        >>> model = sd.smooth_quadratic(f, 0.5)(jax.random.key(0), jnp.ones(2))
         >>> model.hessian.mv(model.grad).shape
-        (3,)
+        (2,)
 
     Source: Stochastic Gradient Estimation for Higher-order Differentiable Rendering, eq. 17-22.
     """

@@ -108,16 +108,16 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
 
     Example:
         >>> import jax, jax.numpy as jnp, smoothdiff as sd
-        >>> hidden = jax.random.uniform(jax.random.key(1), (16, 16))
+        >>> hidden = jax.random.uniform(jax.random.key(1), (8, 8))
         >>> blur = lambda x: (x + jnp.roll(x, 1, 0) + jnp.roll(x, 1, 1)) / 3
         >>> picture = lambda x: jnp.round(32 * blur(x)) / 32
         >>> result = sd.least_squares(
         ...     lambda x, photo: picture(x) - photo,
-        ...     jnp.full((16, 16), 0.5),
+        ...     jnp.full((8, 8), 0.5),
         ...     picture(hidden),
         ...     key=jax.random.key(0),
         ...     solver=sd.LocalGaussNewton(0.1, sd.local_support(1)),
-        ...     max_evaluations=1500,
+        ...     max_evaluations=300,
         ... )
         >>> bool(jnp.mean(jnp.abs(picture(result.y) - picture(hidden))) < 1 / 32)
         True

@@ -112,7 +112,7 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
         >>> plateaus = lambda y, args: jnp.sum(jnp.floor(4 * jnp.abs(y - 1)))
         >>> result = sd.minimise(
         ...     plateaus, jnp.zeros(2), key=jax.random.key(0), solver=sd.ZeroGrads(0.5),
-        ...     max_evaluations=1000,
+        ...     max_evaluations=400,
         ... )
         >>> [round(float(y)) for y in result.y]
         [1, 1]
