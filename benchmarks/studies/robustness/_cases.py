@@ -57,9 +57,8 @@ def scored(task: Task) -> Task:
     """
     away = lambda y: jnp.sum((y - task.score.reference) ** 2)
     score = dataclasses.replace(task.score, loss=away)
-    return dataclasses.replace(
-        task, problem=dataclasses.replace(task.problem, budget=BUDGET), score=score
-    )
+    problem = dataclasses.replace(task.problem, budget=BUDGET)
+    return dataclasses.replace(task, problem=problem, score=score)
 
 
 def anywhere(task: Task) -> Task:

@@ -16,7 +16,7 @@ WIDE, TALL = 3.3, 2.8  # inches of a panel
 def panels(
     path: Path, shown: Mapping[str, Any], x: str, y: str, abreast: int = 4
 ) -> Iterator[list[tuple[Any, Any]]]:
-    """An axis for each title and what it shows; below them is said what is labelled in any."""
+    """An axis for each title and what it shows; below them is said what is in each."""
     columns = min(abreast, len(shown))
     rows = -(-len(shown) // columns)
     with figure(path, rows, columns, (WIDE * columns, TALL * rows + 0.6)) as (drawn, axes):
@@ -29,22 +29,17 @@ def panels(
         for axis, title in zip(axes.flat, shown, strict=False):
             axis.set_title(title)
         yield list(zip(axes.flat, shown.values(), strict=False))
-        labelled = {}
-        for axis in axes.flat:
-            handles, labels = axis.get_legend_handles_labels()
-            labelled |= dict(zip(labels, handles, strict=True))
-        legend(drawn, list(labelled.values()), list(labelled))
+        legend(drawn, *axes[0, 0].get_legend_handles_labels())
 
 
 def curves(
     axis: Any, x: Sequence[float], found: Mapping[str, Any], floor: float = -np.inf, **line: Any
 ) -> None:
-    """By label, lower quartile, median and upper quartile at each x; None is not drawn."""
+    """By label, lower quartile, median and upper quartile at each x."""
     for colour, (label, quartiles) in zip(COLOURS, found.items(), strict=False):
-        if quartiles is not None:
-            low, middle, high = np.maximum(quartiles, floor)
-            axis.plot(x, middle, color=colour, label=label, **line)
-            axis.fill_between(x, low, high, color=colour, alpha=0.15, lw=0)
+        low, middle, high = np.maximum(quartiles, floor)
+        axis.plot(x, middle, color=colour, label=label, **line)
+        axis.fill_between(x, low, high, color=colour, alpha=0.15, lw=0)
 
 
 def sized(tasks: dict[str, Any]) -> dict[str, Any]:
