@@ -6,6 +6,7 @@ picked by hand.
 
 import base64
 import io
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -13,8 +14,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from PIL import Image
 
-from benchmarks._loop import Runs, able
-from benchmarks._task import Task
+from benchmarks._loop import Run
+from benchmarks._task import Method, Task
 
 LARGEST = 128  # pixels along the longer side
 WHITE = 99.5  # percent of the start's differences that are less than white
@@ -28,9 +29,14 @@ class Pictures(NamedTuple):
     reference: np.ndarray
 
 
-def rendered(task: Task, runs: Runs) -> str | None:
-    """The pictures below one another, a PNG as text; None where the task has no picture."""
-    image, ran = task.score.image, able(runs)
+def rendered(task: Task, ran: Mapping[Method, list[Run]]) -> str | None:
+    """The pictures below one another, a PNG as text; None where the task has no picture.
+
+    Args:
+        task: The task.
+        ran: The runs of each method that was able.
+    """
+    image = task.score.image
     if image is None or not ran:
         return None
     unravel = ravel_pytree(task.problem.like)[1]

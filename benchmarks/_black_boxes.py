@@ -51,7 +51,8 @@ def measure(name: str, options: Namespace, folder: Path, bar: tqdm | None = None
             progress=True if bar is None else bar,
         )
         with precision_of(task):
-            tasks[task.name] = summarise(task, runs) | {"pictures": _atlas.rendered(task, runs)}
+            pictures = _atlas.rendered(task, _loop.able(runs))
+            tasks[task.name] = summarise(task, runs) | {"pictures": pictures}
     return {"title": entry.title, "tasks": tasks}
 
 

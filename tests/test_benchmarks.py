@@ -32,7 +32,7 @@ def bowl_start(seed):
     return {"a": y[0], "b": y[1:]}
 
 
-def like(value, dtype=np.float32):
+def like(value, dtype: type = np.float32):
     return {"a": np.full((), value, dtype), "b": np.full(2, value, dtype)}
 
 
@@ -87,6 +87,7 @@ def runs_of(task, method, folder, fresh=False):
 def test_counts_every_evaluation_under_jit_vmap_and_scan():
     counter = _loop.Counter()
     seen = counter.watched(changed(BOWL, residuals=lambda y: y["b"]).problem)
+    assert seen.residuals is not None
     y = bowl_start(0)
     assert jax.jit(seen.loss)(y) == bowl_loss(y)
     assert counter.evaluations == 1

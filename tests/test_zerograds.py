@@ -314,6 +314,7 @@ def test_a_large_offset_leaves_only_its_own_rounding():
     np.testing.assert_allclose(solution.value, TARGET, atol=0.15)
 
 
+@pytest.mark.slow
 def test_sigma_and_its_units_scale_the_run():
     """The surrogate sees units of sigma: other units give the same run."""
 
@@ -411,6 +412,7 @@ def test_iterates_are_those_of_minimise(dtype, to_the_last_bit, tmp_path):
     assert len(again.history) == 30
 
 
+@pytest.mark.slow
 def test_vmap_over_keys_and_starts_is_a_loop_over_them():
     keys, starts = jax.random.split(KEY, 3), jnp.array([[0.0, 0.0], [1.0, 1.0], [-1.0, 0.5]])
     one = lambda key, y0: quick(BOWL, y0, key=key).value

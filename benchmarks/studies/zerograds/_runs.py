@@ -24,9 +24,9 @@ BUDGETS = {
 
 
 def load(name: str) -> Task:
-    """A task of BUDGETS."""
-    task = _registry.task(name).build(False)
-    assert isinstance(task, Task)
+    """A task of BUDGETS; of a family the first."""
+    built = _registry.task(name).build(False)
+    task = built[0] if isinstance(built, list) else built
     problem = dataclasses.replace(task.problem, budget=Budget(BUDGETS[name], PLENTY))
     return dataclasses.replace(task, problem=problem)
 
