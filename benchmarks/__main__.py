@@ -1,16 +1,20 @@
 """The command line: `python -m benchmarks list | run TASK... | draw NAME... | overhead | ...`."""
 
 import argparse
-import json
 import sys
+from functools import partial
 from pathlib import Path
+from types import ModuleType
 
+import jax
 from rich.console import Console
 from rich.table import Table
+from tqdm import tqdm
 
-from benchmarks import _registry, _run, _study
+from benchmarks import _black_boxes, _descents, _registry, _study
 from benchmarks._task import NotAble
 
+STARTS = {False: 5, True: 20}  # of most scenes, quick and full: a guess, for the bar only
 FLAGS: dict[str, dict] = {
     "full": {"action": "store_true", "help": "every start, at full size"},
     "seeds": {"type": int, "metavar": "N", "help": "number of starts"},
@@ -54,47 +58,72 @@ def main(arguments: list[str] | None = None, runs: Path = _study.RUNS) -> None:
         _list()
     elif options.command == "run":
         if "all" in options.names:
-            _run.run_scenes(options, runs)
-        for name in options.names:
-            if name != "all":
-                _run_task(name, options, runs / name)
+            _run_scenes(options, runs)
+        for name in (name for name in options.names if name != "all"):
+            try:
+                _run(name, options, runs / name)
+            except NotAble as reason:
+                Console().print(f"{name} is not able here: {reason}.")
     elif options.command == "draw":
         for name in options.names:
             _draw(name, runs / name)
     else:
         study = _registry.studies()[options.command]
-        run = getattr(study, "run", None)
-        if run is None:
-            _study.run(study, options, runs / options.command)
-        else:
-            run(options, runs)
-
-
-def _run_task(name: str, options: argparse.Namespace, folder: Path) -> None:
-    try:
-        _run.run_one(name, options, folder)
-    except NotAble as reason:
-        Console().print(f"{name} is not able here: {reason}.")
-
-
-def _draw(name: str, folder: Path) -> None:
-    """Draws and shows committed results again, from their numbers alone."""
-    committed = _study.COMMITTED / name / "results.json"
-    if not committed.exists():
-        raise SystemExit(f"There are no committed results of {name!r}.")
-    results = json.loads(committed.read_text())
-    study = _registry.studies().get(name) or _run.shown_by(name)
-    study.draw(results, folder)
-    _study.show(study.tables(results))
-    Console().print(f"Drawn into {folder}")
+        run = getattr(study, "run", partial(_study.run, study))
+        run(options, runs / options.command)
 
 
 def _list() -> None:
-    for title, entries in (("Tasks", _registry.tasks()), ("Methods", _registry.method_entries())):
+    methods = {name: _registry.method(name) for name in _registry.methods()}
+    for title, entries in (("Tasks", _registry.tasks()), ("Methods", methods)):
         shown = Table(title=title, show_header=False, title_justify="left")
         for name, entry in entries.items():
             shown.add_row(name, entry.title)
         Console().print(shown)
+
+
+def _study_of(name: str) -> ModuleType:
+    """What measures, draws and shows a task, by its kind."""
+    return _descents if _registry.task(name).kind == "descent" else _black_boxes
+
+
+def _run(name: str, options: argparse.Namespace, folder: Path, bar: tqdm | None = None) -> None:
+    """Runs a task, with the bar of several scenes or one of its own."""
+    study = _study_of(name)
+    _study.run(study, options, folder, partial(study.measure, name, bar=bar))
+
+
+def _run_scenes(options: argparse.Namespace, runs: Path) -> None:
+    """All scenes, one after the other, with one bar; a scene that fails is named at the end."""
+    starts = options.seeds or STARTS[options.full]
+    usual = partial(_black_boxes.usual, options=options)
+    planned = {name: len(usual(name)) * starts for name in _registry.scenes()}
+    missing = []
+    with tqdm(total=sum(planned.values()), unit="run") as bar:
+        while planned:
+            name = next(iter(planned))
+            try:
+                with _black_boxes.forgiving():
+                    _run(name, options, runs / name, bar)
+            except NotAble as reason:
+                missing.append(f"{name} is not able here: {reason}.")
+            del planned[name]
+            bar.total = bar.n + sum(planned.values())
+            jax.clear_caches()  # what was compiled for it would stay in memory
+    for line in missing:
+        Console().print(line, markup=False)
+    Console().print("The page of these runs: python -m benchmarks report --runs")
+
+
+def _draw(name: str, folder: Path) -> None:
+    """Draws and shows committed results again, from their numbers alone."""
+    results = _study.committed(name)
+    if results is None:
+        raise SystemExit(f"There are no committed results of {name!r}.")
+    study = _registry.studies().get(name) or _study_of(name)
+    study.draw(results, folder)
+    _study.show(study.tables(results))
+    Console().print(f"Drawn into {folder}")
 
 
 if __name__ == "__main__":

@@ -30,12 +30,7 @@ class Pictures(NamedTuple):
 
 
 def rendered(task: Task, ran: Mapping[Method, list[Run]]) -> str | None:
-    """The pictures below one another, a PNG as text; None where the task has no picture.
-
-    Args:
-        task: The task.
-        ran: The runs of each method that was able.
-    """
+    """The pictures below one another, a PNG as text; None where the task has no picture."""
     image = task.score.image
     if image is None or not ran:
         return None

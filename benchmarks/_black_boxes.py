@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from benchmarks import _atlas, _loop, _registry
 from benchmarks._pictures import draw
+from benchmarks._study import setting
 from benchmarks._summary import summarise
 from benchmarks._tables import compare, tables
 from benchmarks._task import Method, NotAble, Problem, Solve, precision_of
@@ -25,35 +26,25 @@ def usual(name: str, options: Namespace) -> list[str]:
 
 
 def measure(name: str, options: Namespace, folder: Path, bar: tqdm | None = None) -> dict[str, Any]:
-    """Runs methods on a task, or on each task of a family.
+    """Runs methods on a task, or on each task of a family; the folder keeps the runs.
 
-    Args:
-        name: The name of the task.
-        options: The command line's: methods, full, seeds and fresh.
-        folder: Where the files of the runs are.
-        bar: The bar of several scenes. With it, a method that fails is named like one that is
-            not able, and the others go on.
+    With the bar of several scenes, a method that fails is named like one that is not able, and the
+    others go on.
     """
-    entry = _registry.task(name)
-    built = entry.build(options.full)
     methods = [_registry.method(method) for method in usual(name, options)]
     if bar is not None:
         methods = [_forgiven(method) for method in methods]
     tasks = {}
-    for task in built if isinstance(built, list) else [built]:
-        runs = _loop.run(
-            task,
-            methods,
-            range(options.seeds or task.seeds),
-            folder / "raw" / task.name,
-            setting="full" if options.full else "quick",
-            fresh=options.fresh,
-            progress=True if bar is None else bar,
-        )
+    how = {"setting": setting(options), "fresh": options.fresh, "progress": bar}
+    for task in _registry.family(name, options.full):
+        seeds = range(options.seeds or task.seeds)
+        runs = _loop.run(task, methods, seeds, folder / "raw" / task.name, **how)
         with precision_of(task):
             pictures = _atlas.rendered(task, _loop.able(runs))
             tasks[task.name] = summarise(task, runs) | {"pictures": pictures}
-    return {"title": entry.title, "tasks": tasks}
+    if bar is not None:
+        bar.clear()  # what is printed next would be on its line
+    return {"title": _registry.task(name).title, "tasks": tasks}
 
 
 def _forgiven(method: Method) -> Method:

@@ -22,7 +22,8 @@ from benchmarks import _loop, _registry
 from benchmarks._atlas import display
 from benchmarks._descent import Configuration, Descent, methods
 from benchmarks._grid import Grid, Row, spread
-from benchmarks._style import COLOURS, figure, legend, looks
+from benchmarks._study import setting
+from benchmarks._style import COLOURS, band, figure, headed, legend, looks, panels
 from benchmarks._summary import cost_to_level, quartiles
 from benchmarks._task import Budget, Method, precision_of
 
@@ -35,22 +36,11 @@ BRIGHTEST = 99  # percentile of a grey picture that is shown as white
 def measure(name: str, options: Namespace, folder: Path, bar: tqdm | None = None) -> dict[str, Any]:
     """Compares the configurations of a task, or of each task of a family.
 
-    Args:
-        name: The name of the task.
-        options: The command line's: full, seeds and fresh.
-        folder: Where the files of the runs are, and pictures of what the first start found.
-        bar: The bar of several tasks, or None.
+    The folder keeps the runs, and has pictures of what the first start found.
     """
-    entry = _registry.task(name)
-    built = entry.build(options.full)
-    family = {task.name: task for task in (built if isinstance(built, list) else [built])}
-    run = partial(
-        _loop.run,
-        folder=folder / "raw",
-        setting="full" if options.full else "quick",
-        fresh=options.fresh,
-        progress=True if bar is None else bar,
-    )
+    family = {task.name: task for task in _registry.family(name, options.full)}
+    how: dict[str, Any] = {"setting": setting(options), "fresh": options.fresh, "progress": bar}
+    run = partial(_loop.run, folder=folder / "raw", **how)
     tasks = {}
     for member, task in family.items():
         assert isinstance(task, Descent)
@@ -58,7 +48,7 @@ def measure(name: str, options: Namespace, folder: Path, bar: tqdm | None = None
         with precision_of(task):
             into = _folder(folder, member, family)
             tasks[member] = compared(shared, options.seeds or task.seeds, run, into)
-    return {"title": entry.title, "tasks": tasks}
+    return {"title": _registry.task(name).title, "tasks": tasks}
 
 
 def compared(
@@ -132,14 +122,12 @@ def tables(results: dict[str, Any]) -> Iterator[Grid]:
     for task in results["tasks"].values():
         configurations = list(task["configurations"].values())
         for error, marks in configurations[0]["at_marks"].items():
+            shown = ((of["title"], of["at_marks"][error].values()) for of in configurations)
             yield Grid(
                 title=f"{task['title']}: {error}",
                 caption="Median [quartiles] over the starts, after so many iterations.",
                 columns=("configuration", *marks),
-                rows=tuple(
-                    Row(found["title"], tuple(map(spread, found["at_marks"][error].values())))
-                    for found in configurations
-                ),
+                rows=tuple(Row(name, tuple(map(spread, found))) for name, found in shown),
             )
         yield _to_levels(task, configurations)
 
@@ -186,21 +174,18 @@ def _curves(task: dict[str, Any], cost: str, path: Path) -> None:
     """Median and quartiles over the starts, a panel for each error."""
     configurations = task["configurations"]
     look = looks(configurations)
-    errors = list(next(iter(configurations.values()))["curves"])
-    with figure(path, 1, len(errors), (4.5 * len(errors), 3.8)) as (drawn, axes):
-        for axis, error in zip(axes[0], errors, strict=True):
+    names = list(next(iter(configurations.values()))["curves"])
+    with panels(path, names, len(names), (4.5, 3.2)) as (drawn, axes):
+        for axis, error in zip(axes[0], names, strict=True):
             for name, found in configurations.items():
                 costs = found[cost][1:]
-                low, middle, high = np.array(found["curves"][error], float)[:, 1:]  # None is NaN
-                axis.plot(costs, middle, label=found["title"], **look[name])
-                colour = look[name]["color"]
-                axis.fill_between(costs, low, high, color=colour, alpha=0.15, lw=0)
+                errors = np.array(found["curves"][error], float)[:, 1:]
+                band(axis, costs, errors, look[name], found["title"])
             bottom, top = axis.dataLim.intervaly
-            axis.set(xscale="log", xlabel=cost.capitalize(), title=error)
+            axis.set(xscale="log", xlabel=cost.capitalize())
             axis.set(yscale="log", ylim=(max(bottom, FLOOR * top) / 1.3, 1.3 * top))
         legend(drawn, *axes[0, 0].get_legend_handles_labels())
-        title = f"{task['title']}\nMedian and quartiles over {task['starts']} starts"
-        drawn.suptitle(title, x=0.01, ha="left", fontsize=10)
+        headed(drawn, f"{task['title']}\nMedian and quartiles over {task['starts']} starts")
 
 
 def _draw_found(task: Descent, found: dict[str, np.ndarray], path: Path) -> None:

@@ -7,8 +7,9 @@ benchmark goes on where it was.
 import dataclasses
 import itertools
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ GROWTH = 1.1  # a trace keeps a point when the evaluations have grown by this fa
 WARM_UP_SEED = 1_000_003  # a start that is not in any ensemble
 WARM_UP_ITERATIONS = 3
 
+Point = tuple[int, float, np.ndarray]  # evaluations, seconds, the parameters as a vector
 Run = dict[str, Any]  # seed, ended, warm_up_seconds, evaluations, seconds, an array for each error
 Runs = dict[Method, list[Run] | NotAble]
 
@@ -125,11 +127,86 @@ class Recorder:
             if solved:
                 raise Stop("at the optimum")
 
-    def finish(self) -> list[tuple[int, float, np.ndarray]]:
+    def finish(self) -> list[Point]:
         """The points kept, with the last one."""
         if self.trace[-1] is not self._last:
             self.trace.append(self._last)
         return self.trace
+
+
+class Runner:
+    """Runs methods on a task: prepared once, counted, stopped, and scored.
+
+    Args:
+        task: The task.
+        keep: After so many evaluations what a run found is kept too, beside the last.
+    """
+
+    def __init__(self, task: Task, keep: Collection[int]):
+        self._task, self._keep, self._counter = task, keep, Counter()
+        self._problem = self._counter.watched(task.problem)
+        self._exact_loss = jax.jit(lambda y: task.exact_loss(y))  # there may be none
+        self._prepared: dict[Method, tuple[Solve, float]] = {}
+
+    def __call__(self, method: Method, seed: int) -> Run:
+        """One run with its scores."""
+        if method not in self._prepared:
+            began = time.perf_counter()
+            solve = method.prepare(self._problem)
+            # it compiles on a start of its own, which is not charged to it
+            self._record(solve, WARM_UP_SEED, iterations=WARM_UP_ITERATIONS)
+            self._prepared[method] = solve, time.perf_counter() - began
+        solve, warm_up = self._prepared[method]
+        lowest = self._task.score.optimum
+        above = None if lowest is None else lambda y: float(self._exact_loss(y)) - lowest
+        trace, ended = self._record(solve, seed, gap=above)
+        unravel = ravel_pytree(self._task.problem.like)[1]
+        evaluations, seconds, ys = zip(*trace, strict=True)
+        errors = self._errors if self._task.score.errors is None else self._own_errors
+        return {
+            "warm_up_seconds": warm_up,
+            "seed": seed,
+            "ended": ended,
+            "evaluations": np.array(evaluations),
+            "seconds": np.array(seconds),
+            **errors([unravel(y) for y in ys], seed),
+            "found": ys[-1],
+            **{f"found {n}": y for n, y in zip(evaluations, ys, strict=True) if n in self._keep},
+        }
+
+    def _record(self, solve: Solve, seed: int, **until: Any) -> tuple[list[Point], str]:
+        """The trace of a run, and why it ended."""
+        if self._task.choose is not None:
+            self._task.choose(seed)
+        y0 = self._task.start(seed)
+        recorder = Recorder(self._counter, self._problem, y0, **until)
+        try:
+            solve(y0, jax.random.key(seed), recorder)
+        except Stop as stop:
+            return recorder.finish(), str(stop)
+        return recorder.finish(), "by the method"
+
+    def _errors(self, points: list[Y], seed: int) -> dict[str, Any]:
+        """Errors relative to those of the start, except for the gap."""
+        score, choose = self._task.score, self._task.choose
+        gap = np.array([float(self._exact_loss(y)) for y in points]) - (score.optimum or 0.0)
+        sought = score.reference if choose is None else choose(seed)
+        length = lambda y: np.linalg.norm(flat(y).astype(float) - flat(sought))
+        away = length if score.distance is None else jax.jit(score.distance)
+        distance = np.array([float(away(y)) for y in points])
+        return {
+            "image_error": gap / gap[0],
+            "parameter_error": distance / distance[0],
+            **({} if score.optimum is None else {"gap": gap}),
+            "distance": float(distance[-1]),
+        }
+
+    def _own_errors(self, points: list[Y], seed: int) -> dict[str, Any]:
+        assert self._task.score.errors is not None
+        errors, scene = jax.jit(self._task.score.errors), self._task.problem.scene()
+        each = [errors(y, scene) for y in points]
+        found = {name: np.array([float(one[name]) for one in each]) for name in each[0]}
+        return {name: np.where(np.isnan(of), np.inf, of) for name, of in found.items()}  # diverged
 
 
 def run(
@@ -140,7 +217,7 @@ def run(
     *,
     setting: str = "quick",
     fresh: bool = False,
-    progress: bool | tqdm = True,
+    progress: tqdm | bool | None = None,
     keep: Collection[int] = (),
 ) -> Runs:
     """Runs each method from each start, unless its file is there and is still valid.
@@ -155,42 +232,24 @@ def run(
         folder: Where the files of the runs are.
         setting: "quick" or "full", a part of their names.
         fresh: Run again what has been run.
-        progress: Show a bar, or go on with this one.
-        keep: After so many evaluations what a run found is kept too, beside the last.
-
-    Returns:
-        The runs of each method, or why it is not able.
+        progress: A bar to go on with; by default one of its own; False is none.
+        keep: As for `Runner`.
     """
-    counter = Counter()
-    problem = counter.watched(task.problem)
-    prepared: dict[Method, tuple[Solve, float]] = {}
-    exact_loss = jax.jit(lambda y: task.exact_loss(y))  # there may be none
-
-    def make(method: Method, seed: int) -> Run:
-        if method not in prepared:
-            prepared[method] = _warm_up(task, problem, method, counter)
-        solve, warm_up = prepared[method]
-        scored = _solve(task, problem, solve, seed, counter, exact_loss, keep)
-        return {"warm_up_seconds": warm_up} | scored
-
-    def obtain(method: Method, seed: int) -> Run:
-        path = folder / f"{method.name}-{seed}-{setting}.npz"
-        stale = fingerprint(behaviour, method.source, sorted(keep))
-        return kept(path, stale, lambda: make(method, seed), fresh)
-
-    runs: dict[Method, list[Run]] = {method: [] for method in methods}
-    not_able: dict[Method, NotAble] = {}
+    runner, found = Runner(task, keep), dict[Method, Any]((method, []) for method in methods)
     with precision_of(task), _bar(progress, len(methods) * len(seeds)) as bar:
         behaviour = _behaviour(task)
         for seed, method in itertools.product(seeds, methods):
             bar.set_description(f"{task.name}: start {seed}, {method.name}")
-            if method not in not_able:
+            path = folder / f"{method.name}-{seed}-{setting}.npz"
+            stale = fingerprint(behaviour, method.source, sorted(keep))
+            if isinstance(found[method], list):
                 try:
-                    runs[method].append(obtain(method, seed))
+                    made = kept(path, stale, partial(runner, method, seed), fresh)
+                    found[method].append(made)
                 except NotAble as reason:
-                    not_able[method] = reason
+                    found[method] = reason
             bar.update()
-    return runs | not_able
+    return found
 
 
 def able(runs: Runs) -> dict[Method, list[Run]]:
@@ -203,94 +262,10 @@ def flat(y: Y) -> np.ndarray:
     return np.concatenate([np.ravel(np.asarray(leaf)) for leaf in jax.tree.leaves(y)])
 
 
-def _bar(progress: bool | tqdm, runs: int) -> AbstractContextManager[tqdm]:
+def _bar(progress: tqdm | bool | None, runs: int) -> AbstractContextManager[tqdm]:
     if isinstance(progress, tqdm):
         return nullcontext(progress)
-    return tqdm(total=runs, disable=not progress, unit="run")
-
-
-def _warm_up(task: Task, problem: Problem, method: Method, counter: Counter) -> tuple[Solve, float]:
-    """Prepares a method and lets it compile on a start of its own, which is not charged to it."""
-    began = time.perf_counter()
-    solve = method.prepare(problem)
-    _record(task, problem, solve, WARM_UP_SEED, counter, iterations=WARM_UP_ITERATIONS)
-    return solve, time.perf_counter() - began
-
-
-def _record(
-    task: Task,
-    problem: Problem,
-    solve: Solve,
-    seed: int,
-    counter: Counter,
-    iterations: float = np.inf,
-    gap: Callable[[Y], float] | None = None,
-) -> tuple[list[tuple[int, float, np.ndarray]], str]:
-    """The trace of a run, and why it ended."""
-    if task.choose is not None:
-        task.choose(seed)
-    y0 = task.start(seed)
-    recorder = Recorder(counter, problem, y0, iterations, gap)
-    ended = "by the method"
-    try:
-        solve(y0, jax.random.key(seed), recorder)
-    except Stop as stop:
-        ended = str(stop)
-    return recorder.finish(), ended
-
-
-def _solve(
-    task: Task,
-    problem: Problem,
-    solve: Solve,
-    seed: int,
-    counter: Counter,
-    exact_loss: Callable[[Y], jax.Array],
-    keep: Collection[int],
-) -> Run:
-    """One run with its scores."""
-    lowest = task.score.optimum
-    above = None if lowest is None else lambda y: float(exact_loss(y)) - lowest
-    trace, ended = _record(task, problem, solve, seed, counter, gap=above)
-    unravel = ravel_pytree(task.problem.like)[1]
-    evaluations, seconds, ys = zip(*trace, strict=True)
-    points = [unravel(y) for y in ys]
-    errors = _errors if task.score.errors is None else _own_errors
-    return {
-        "seed": seed,
-        "ended": ended,
-        "evaluations": np.array(evaluations),
-        "seconds": np.array(seconds),
-        **errors(task, points, seed, exact_loss),
-        "found": ys[-1],
-        **{f"found {n}": y for n, y in zip(evaluations, ys, strict=True) if n in keep},
-    }
-
-
-def _errors(task: Task, points: list[Y], seed: int, exact_loss: Callable) -> Mapping[str, Any]:
-    """Errors relative to those of the start, except for the gap."""
-    score = task.score
-    gap = np.array([float(exact_loss(y)) for y in points]) - (score.optimum or 0.0)
-    sought = score.reference if task.choose is None else task.choose(seed)
-    if score.distance is None:
-        distance = np.array([np.linalg.norm(flat(y).astype(float) - flat(sought)) for y in points])
-    else:
-        away = jax.jit(score.distance)
-        distance = np.array([float(away(y)) for y in points])
-    return {
-        "image_error": gap / gap[0],
-        "parameter_error": distance / distance[0],
-        **({} if score.optimum is None else {"gap": gap}),
-        "distance": float(distance[-1]),
-    }
-
-
-def _own_errors(task: Task, points: list[Y], seed: int, exact_loss: Callable) -> Mapping[str, Any]:
-    assert task.score.errors is not None
-    errors, scene = jax.jit(task.score.errors), task.problem.scene()
-    each = [errors(y, scene) for y in points]
-    found = {name: np.array([float(one[name]) for one in each]) for name in each[0]}
-    return {name: np.where(np.isnan(of), np.inf, of) for name, of in found.items()}  # it diverged
+    return tqdm(total=runs, disable=progress is False, unit="run")
 
 
 def _behaviour(task: Task) -> str:

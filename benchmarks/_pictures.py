@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks._atlas import stored
 from benchmarks._grid import short
-from benchmarks._style import CROWDED, figure, legend, looks
+from benchmarks._style import CROWDED, band, figure, headed, legend, looks, panels
 from benchmarks._summary import COSTS, GAPS, LEVELS, able, grid
 
 FLOORS = {"image_error": 1e-7, "parameter_error": 1e-7, "gap": 1e-10}  # the smallest error drawn
@@ -47,6 +47,11 @@ def errors_of(task: dict[str, Any]) -> list[str]:
     return [error for error in LEVELS if any(error in f["final"] for f in able(task).values())]
 
 
+def titles_of(tasks: dict[str, Any]) -> dict[str, str]:
+    """Of all methods that ran on any of the tasks."""
+    return {name: found["title"] for task in tasks.values() for name, found in able(task).items()}
+
+
 def ours_of(methods: dict[str, Any]) -> list[str]:
     """Those that are this library's."""
     return [name for name, found in methods.items() if "(ours)" in found["title"]]
@@ -70,7 +75,7 @@ def _curves(task: dict[str, Any], cost: str, path: Path) -> None:
         what = "medians, quartiles of ours," if strong else "median and quartiles"
         legend(drawn, *axes[0, 0].get_legend_handles_labels())
         title = f"{task['title']}: {what} over {starts}"
-        drawn.suptitle(title, x=0.01, ha="left", fontsize=10)
+        headed(drawn, title)
 
 
 def panel(
@@ -89,11 +94,9 @@ def panel(
             continue
         costs = grid(curve["ends"])
         quartiles = np.nan_to_num(np.array(curve["quartiles"], float), nan=np.inf)
-        low, middle, high = np.maximum(quartiles, FLOORS[error])
-        axis.plot(costs, middle, label=found["title"], **look[name])
-        if name in banded:
-            axis.fill_between(costs, low, high, color=look[name]["color"], alpha=0.15, lw=0)
-        shown = middle[np.isfinite(middle)]
+        three = np.maximum(quartiles, FLOORS[error])
+        band(axis, costs, three, look[name], found["title"], 0.15 if name in banded else 0)
+        shown = three[1][np.isfinite(three[1])]
         lowest, highest = min(lowest, *shown), max(highest, *shown)
     axis.set(ylim=(lowest / 1.3, highest * 1.3))
     axis.set(xscale="log", yscale="log", xlabel=LABELS[cost], title=LABELS[error])
@@ -128,33 +131,27 @@ def _images(task: dict[str, Any], path: Path) -> None:
 def _family(results: dict[str, Any], path: Path) -> None:
     """Evaluations to the smallest gap against dimensions, a panel for each function."""
     tasks = results["tasks"]
-    titles = {name: found["title"] for task in tasks.values() for name, found in able(task).items()}
+    titles = titles_of(tasks)
     look = looks(titles)
-    panels = groupby(tasks.items(), key=lambda item: item[0].rpartition("-")[0])
-    functions = [(name, [task for _, task in members]) for name, members in panels]
-    columns = min(COLUMNS, len(functions))
-    rows = -(-len(functions) // columns)
+    named = groupby(tasks.items(), key=lambda item: item[0].rpartition("-")[0])
+    functions = {name: [task for _, task in members] for name, members in named}
     most = max(task["budget"]["evaluations"] for task in tasks.values())
-    with figure(path, rows, columns, (max(6, 3 * columns), 2.8 * rows + 0.6)) as (drawn, axes):
-        for axis in axes.flat[len(functions) :]:
-            axis.set_visible(False)
-        for axis, (function, members) in zip(axes.flat, functions, strict=False):
+    with panels(path, functions, COLUMNS, (3, 2.8)) as (drawn, axes):
+        for axis, members in zip(axes.flat, functions.values(), strict=False):
             for method in titles:
                 _medians(axis, [task for task in members if method in able(task)], method, look)
             dimensions = [task["dimensions"] for task in members]
-            axis.set(xscale="log", yscale="log", ylim=(FEWEST, 1.5 * most), title=function)
+            axis.set(xscale="log", yscale="log", ylim=(FEWEST, 1.5 * most))
             axis.set_xticks(dimensions, [f"{n}-D" for n in dimensions])
             axis.xaxis.minorticks_off()
         for axis in axes[:, 0]:
             axis.set_ylabel("Evaluations")
         handles = [axes[0, 0].plot([], [], marker="o", **look[name])[0] for name in titles]
         legend(drawn, handles, list(titles.values()))
-        drawn.suptitle(
+        headed(
+            drawn,
             f"{results['title']}: median evaluations to a gap of {GAP}\n"
             "Open: the budget, where no more than half of the starts got there",
-            x=0.01,
-            ha="left",
-            fontsize=10,
         )
 
 

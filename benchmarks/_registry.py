@@ -16,7 +16,7 @@ from types import ModuleType
 from benchmarks import methods as methods_package
 from benchmarks import studies as studies_package
 from benchmarks import tasks as tasks_package
-from benchmarks._task import Kind, Method, MethodEntry, TaskEntry
+from benchmarks._task import Kind, Method, MethodEntry, Task, TaskEntry
 
 ORDER: tuple[Kind, ...] = ("scene", "large", "network", "program", "function", "descent")
 SCENES = ("scene", "large", "network")  # the kinds that `run all` runs and `report` shows
@@ -40,6 +40,12 @@ def task(name: str) -> TaskEntry:
     return _named(tasks(), name, "task")
 
 
+def family(name: str, full: bool) -> list[Task]:
+    """The task of a name, or all that it stands for."""
+    built = task(name).build(full)
+    return built if isinstance(built, list) else [built]
+
+
 def scenes() -> list[str]:
     """The tasks that `run all` runs."""
     return [name for name, entry in tasks().items() if entry.kind in SCENES]
@@ -57,13 +63,8 @@ def _entries() -> dict[str, tuple[ModuleType, MethodEntry]]:
 
 
 def methods(kind: Kind | None = None) -> list[str]:
-    """The names of all methods, or of those that run on a kind of task unasked."""
+    """The names of all methods, ours last, or of those that run on a kind of task unasked."""
     return [name for name, (_, entry) in _entries().items() if kind is None or kind in entry.kinds]
-
-
-def method_entries() -> dict[str, MethodEntry]:
-    """All methods, ours last."""
-    return {name: entry for name, (_, entry) in _entries().items()}
 
 
 def method(name: str) -> Method:

@@ -10,7 +10,7 @@ import json
 import os
 import platform
 from argparse import Namespace
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from importlib import metadata
 from pathlib import Path
 from types import ModuleType
@@ -31,16 +31,34 @@ PACKAGES = (
 
 def about(options: Namespace) -> dict[str, Any]:
     """What stands at the head of all results."""
-    setting = "full" if getattr(options, "full", False) else "quick"
-    return {"command": options.said, "setting": setting, "machine": machine()}
+    return {"command": options.said, "setting": setting(options), "machine": machine()}
 
 
-def run(study: ModuleType, options: Namespace, folder: Path) -> None:
-    """Measures what has not been measured, writes results.json and pictures, prints tables."""
-    results = write(about(options) | study.measure(options, folder), folder)
+def setting(options: Namespace) -> str:
+    """How large it is, as results and names of files have it."""
+    return "full" if getattr(options, "full", False) else "quick"
+
+
+def run(
+    study: ModuleType, options: Namespace, folder: Path, measure: Callable | None = None
+) -> None:
+    """Measures, if need be not as the study does; writes results.json and pictures, prints tables.
+
+    The folder has the name that the results have among the committed ones.
+    """
+    results = write(about(options) | (measure or study.measure)(options, folder), folder)
     study.draw(results, folder)
     show(study.tables(results))
+    theirs = committed(folder.name) if getattr(options, "compare", False) else None
+    if theirs is not None:
+        show(study.compare(results, theirs))
     Console().print(f"Written to {folder}")
+
+
+def committed(name: str, results: Path | None = None) -> dict[str, Any] | None:
+    """The results of a task or study, of the committed ones or in another folder, if any."""
+    path = (results or COMMITTED) / name / "results.json"
+    return json.loads(path.read_text()) if path.exists() else None
 
 
 def show(grids: Iterable[Grid]) -> None:
@@ -70,12 +88,7 @@ def rounded(tree: Any, digits: int = 4) -> Any:
 
 def machine() -> dict[str, Any]:
     """Where the numbers come from."""
-    versions = {}
-    for package in PACKAGES:
-        try:
-            versions[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            continue
+    versions = {of.name: of.version for of in metadata.distributions() if of.name in PACKAGES}
     return {
         "platform": platform.platform(),
         "cpu": _cpu(),

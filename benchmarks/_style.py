@@ -2,11 +2,12 @@
 
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
-from itertools import cycle
+from itertools import cycle, zip_longest
 from pathlib import Path
 from typing import Any
 
 import matplotlib
+import numpy as np
 
 matplotlib.use("Agg")
 
@@ -48,6 +49,36 @@ def figure(path: Path, rows: int, columns: int, size: tuple[float, float]) -> It
         path.parent.mkdir(parents=True, exist_ok=True)
         drawn.savefig(path)
         plt.close(drawn)
+
+
+@contextmanager
+def panels(
+    path: Path, titles: Collection[str], abreast: int, size: tuple[float, float]
+) -> Iterator[tuple]:
+    """A figure with axes under titles, of a size each, in lines; the legend has room below."""
+    columns = min(abreast, len(titles))
+    rows = -(-len(titles) // columns)
+    whole = max(6, size[0] * columns), size[1] * rows + 0.6
+    with figure(path, rows, columns, whole) as (drawn, axes):
+        for axis, title in zip_longest(axes.flat, titles):
+            axis.set_title(title or "")
+            axis.set_visible(title is not None)
+        yield drawn, axes
+
+
+def band(
+    axis: Any, x: Any, quartiles: Any, look: dict, label: str = "", alpha: float = 0.15
+) -> None:
+    """A median as a line, and a band from the lower quartile to the upper, (3, x), unless clear."""
+    low, middle, high = np.array(quartiles, float)  # None is NaN
+    axis.plot(x, middle, label=label, **look)
+    if alpha:
+        axis.fill_between(x, low, high, color=look["color"], alpha=alpha, lw=0)
+
+
+def headed(drawn: Figure, title: str) -> None:
+    """What all axes are of."""
+    drawn.suptitle(title, x=0.01, ha="left", fontsize=10)
 
 
 def legend(drawn: Figure, handles: list, labels: list[str]) -> None:

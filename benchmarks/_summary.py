@@ -72,7 +72,7 @@ def curve(runs: list[Run], error: str, cost: str) -> dict[str, Any]:
         return {"ends": None, "quartiles": []}
     ends = float(costs[costs > 0].min()), float(costs.max())
     found = band(runs, error, cost, grid(ends))
-    return {"ends": ends, "quartiles": rounded(found.tolist(), DIGITS)}
+    return {"ends": ends, "quartiles": rounded(found, DIGITS)}
 
 
 def grid(ends: Sequence[float]) -> np.ndarray:
@@ -97,14 +97,25 @@ def quartiles(values: Sequence[float]) -> dict[str, float | None]:
     return dict(zip(("median", "lower", "upper"), found, strict=True))
 
 
-def band(runs: list[Run], error: str, cost: str, costs: np.ndarray) -> np.ndarray:
-    """Quartiles of the error over the runs, at each of the costs, (3, costs)."""
-    errors = []
+def quarters(values: Any) -> list[Any]:
+    """Lower quartile, median and upper quartile over the first axis, with means between values."""
+    return np.quantile(values, [0.25, 0.5, 0.75], axis=0).tolist()
+
+
+def band(runs: list[Run], error: str, cost: str, costs: Any) -> list[list[float]]:
+    """Quarters of the error over the runs, at each of the costs, (3, costs)."""
+    errors, costs = [], np.asarray(costs)
     for run in runs:
         # a run stays where it stopped
         last = np.searchsorted(run[cost], costs * (1 + 1e-9), side="right") - 1
         errors.append(np.asarray(run[error])[last])
-    return np.quantile(errors, [0.25, 0.5, 0.75], axis=0)
+    return quarters(errors)
+
+
+def unable(task: dict[str, Any]) -> dict[str, str]:
+    """By title, why the others did not run."""
+    methods = task["methods"].values()
+    return {found["title"]: found["not_able"] for found in methods if "not_able" in found}
 
 
 def able(task: dict[str, Any]) -> dict[str, Any]:

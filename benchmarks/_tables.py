@@ -1,11 +1,12 @@
 """The results of a task as tables: what each level took, and what was left at the end."""
 
 from collections.abc import Iterator
+from itertools import product
 from typing import Any
 
 from benchmarks._grid import Grid, Row, short, spread
-from benchmarks._pictures import GAP, errors_of
-from benchmarks._summary import COSTS, able
+from benchmarks._pictures import GAP, errors_of, titles_of
+from benchmarks._summary import COSTS, able, unable
 
 CAPTIONS = {
     "image_error": "On renders without noise, which are not charged.",
@@ -29,11 +30,12 @@ def _took(task: dict[str, Any], error: str) -> Grid:
     kind, unit = error.replace("_", " "), "" if error == "gap" else " %"
     rows = []
     for found in able(task).values():
-        levels = found["took"][error].items()
-        for i, (level, took) in enumerate(levels):
+        name = found["title"]
+        for level, took in found["took"][error].items():
             there = f"{took['solved']}/{found['starts']}"
-            cells = (level + unit, there, *(spread(took[cost]) for cost in COSTS))
-            rows.append(Row("" if i else found["title"], cells, end=i == len(levels) - 1))
+            rows.append(Row(name, (level + unit, there, *(spread(took[cost]) for cost in COSTS))))
+            name = ""
+        rows[-1] = rows[-1]._replace(end=True)
     return Grid(
         title=f"{task['title']}: reducing the {kind}",
         caption=f"Median [quartiles] over the starts; - is not reached. {CAPTIONS[error]}",
@@ -44,11 +46,7 @@ def _took(task: dict[str, Any], error: str) -> Grid:
 
 def _left(task: dict[str, Any]) -> Grid:
     budget = task["budget"]
-    not_able = " ".join(
-        f"{found['title']} is not able here: {found['not_able']}."
-        for found in task["methods"].values()
-        if "not_able" in found
-    )
+    not_able = " ".join(f"{who} is not able here: {why}." for who, why in unable(task).items())
     rows = []
     for found in able(task).values():
         errors = [found["final"][error] for error in ("image_error", "parameter_error")]
@@ -65,7 +63,6 @@ def _left(task: dict[str, Any]) -> Grid:
 def _family(results: dict[str, Any]) -> Grid:
     """Evaluations of each method on each task, where all have a lowest value."""
     tasks = results["tasks"]
-    titles = {name: found["title"] for task in tasks.values() for name, found in able(task).items()}
 
     def cell(task: dict[str, Any], method: str) -> str:
         found = able(task).get(method)
@@ -80,7 +77,7 @@ def _family(results: dict[str, Any]) -> Grid:
         columns=("method", *tasks),
         rows=tuple(
             Row(title, tuple(cell(task, method) for task in tasks.values()))
-            for method, title in titles.items()
+            for method, title in titles_of(tasks).items()
         ),
     )
 
@@ -91,14 +88,9 @@ def compare(results: dict[str, Any], committed: dict[str, Any]) -> Iterator[Grid
         theirs = able(committed["tasks"].get(name, {"methods": {}}))
         rows = []
         for method, found in able(task).items():
-            if method not in theirs:
-                continue
-            cells = []
-            for cost in COSTS:
-                for each in (found, theirs[method]):
-                    took = each["took"]["image_error"][COMPARED]
-                    cells.append(f"{spread(took[cost])} ({took['solved']}/{each['starts']})")
-            rows.append(Row(found["title"], tuple(cells)))
+            pairs = product(COSTS, (found, theirs[method])) if method in theirs else ()
+            if cells := tuple(_compared(each, cost) for cost, each in pairs):
+                rows.append(Row(found["title"], cells))
         yield Grid(
             title=f"{task['title']}: to {COMPARED} % of the image error, here and committed",
             caption=f"Committed: {committed['command']}, {committed['machine']['cpu']}. "
@@ -106,3 +98,8 @@ def compare(results: dict[str, Any], committed: dict[str, Any]) -> Iterator[Grid
             columns=("method", *(f"{cost}, {who}" for cost in COSTS for who in ("here", "comm."))),
             rows=tuple(rows),
         )
+
+
+def _compared(found: dict[str, Any], cost: str) -> str:
+    took = found["took"]["image_error"][COMPARED]
+    return f"{spread(took[cost])} ({took['solved']}/{found['starts']})"

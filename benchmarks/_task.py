@@ -7,10 +7,13 @@ where it is after each iteration and is stopped by it.
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
+
+from smoothdiff._support import as_support
 
 Y: TypeAlias = Any  # the parameters: an array or a pytree of arrays
 Key: TypeAlias = jax.Array
@@ -30,6 +33,18 @@ class Budget(NamedTuple):
 
     evaluations: int
     seconds: float
+
+
+class Effort(NamedTuple):
+    """How much is run of a task: the budget of a run, and from how many starts."""
+
+    evaluations: int
+    seconds: float
+    seeds: int
+
+    @property
+    def budget(self) -> Budget:
+        return Budget(self.evaluations, self.seconds)
 
 
 class Grey(NamedTuple):
@@ -73,7 +88,7 @@ class Problem:
         residuals: y -> array, such that the loss is the sum or the mean of its squares, or None: a
             picture minus its reference, say. A call is counted like a call of the loss.
         terms: y -> array, such that the loss is the sum of its entries, with `support`; or None. A
-            call is counted likewise.
+            call is counted likewise. By default from the residuals.
         support: Which of the terms a parameter may influence, as for `smoothdiff.smooth`. Then the
             first axes of the residuals are those of the terms.
         grey: The loss in two parts, for methods that use AD where they can; or None. The loss then
@@ -104,11 +119,19 @@ class Problem:
             object.__setattr__(self, "loss", grey.loss)
         elif self.loss is None and residuals is not None:
             object.__setattr__(self, "loss", lambda y: jnp.mean(residuals(y) ** 2))
+        if self.terms is None and self.support is not None and residuals is not None:
+            object.__setattr__(self, "terms", partial(_terms, residuals, as_support(self.support)))
 
     @property
     def like(self) -> Y:
         """Something like y: the lower bounds."""
         return self.bounds[0]
+
+
+def _terms(residuals: Callable[[Y], jax.Array], support: Any, y: Y) -> jax.Array:
+    """The share in their mean square of the residuals that the support does not tell apart."""
+    terms, squares = jax.eval_shape(support.at(y), y), residuals(y) ** 2
+    return jnp.mean(squares, axis=tuple(range(terms.ndim, squares.ndim))) / terms.size
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,6 +220,13 @@ class TaskEntry(NamedTuple):
     title: str
     kind: Kind
     build: Callable[..., Task | list[Task]]
+
+
+def entry(
+    kind: Kind, build: Callable[..., Task | list[Task]], name: str, title: str, **settings: Any
+) -> dict[str, TaskEntry]:
+    """TASKS of one line, which is built by `build(full, name=name, title=title, **settings)`."""
+    return {name: TaskEntry(title, kind, partial(build, name=name, title=title, **settings))}
 
 
 class MethodEntry(NamedTuple):

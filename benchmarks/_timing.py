@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import jax
@@ -23,3 +24,14 @@ def in_turns(calls: Mapping[str, Callable[[int], Any]], turns: int) -> dict[str,
             jax.block_until_ready(calls[name](turn))
             seconds[name][turn] = time.perf_counter() - began
     return {name: each[1:] for name, each in seconds.items()}
+
+
+def compiled(
+    functions: Mapping[str, Callable], inputs: Callable[[int], tuple], turns: int
+) -> dict[str, np.ndarray]:
+    """The same of functions that are compiled first, and see the same inputs in a turn."""
+
+    def call(function: Callable, turn: int) -> Any:
+        return function(*inputs(turn))
+
+    return in_turns({name: partial(call, jax.jit(f)) for name, f in functions.items()}, turns)

@@ -12,7 +12,7 @@ import pytest
 import smoothdiff as sd
 from benchmarks import _registry, _study
 from benchmarks._task import Task
-from benchmarks.scenes._dearer import SAVINGS
+from benchmarks.scenes.mitsuba_scene import SAVINGS
 from benchmarks.studies import filters, overhead, savings
 
 OPTIONS = Namespace(said="a test")

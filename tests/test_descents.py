@@ -16,7 +16,7 @@ import smoothdiff as sd
 from benchmarks import _descents, _registry, _study
 from benchmarks._descent import Configuration, Descent, methods, problem, variants
 from benchmarks._task import Score, Task, TaskEntry
-from benchmarks.scenes import plate, smoke
+from benchmarks.scenes import _monte_carlo, plate, smoke
 from benchmarks.tasks import lines, texture, volume
 
 sgd: Any = optax.sgd
@@ -171,7 +171,7 @@ def test_gradients_of_the_plate_are_unbiased():
     mean, error = mean_and_error(slopes)
 
     def loss(y):  # of the expected picture, since the gradient is that of L(E picture)
-        return plate.loss(plate.exact(y, 20_000), reference)
+        return _monte_carlo.loss(plate.exact(y, 20_000), reference)
 
     truth = directions @ np.ravel(jax.grad(loss)(y))
     # one picture in `exact` is of texels' middles, so a little remains

@@ -10,7 +10,7 @@ from jax.flatten_util import ravel_pytree
 
 from benchmarks import _registry
 from benchmarks._task import Task
-from benchmarks.scenes import mesh_renderer, meshes, soft_mesh
+from benchmarks.scenes import mesh_renderer, meshes
 from benchmarks.tasks import caustic, soft_meshes, texture32
 from smoothdiff._support import as_support
 
@@ -112,7 +112,7 @@ def test_where_a_vertex_is_seen_it_changes_most(moved):
 
 def test_coordinates_of_a_mesh_give_the_mesh(key):
     directions, faces = meshes.icosphere(2)
-    positions = soft_mesh.Soft(0.8 * directions, faces)
+    positions = soft_meshes.Soft(0.8 * directions, faces)
     sought = soft_meshes.head(directions)
     assert np.asarray(positions(jnp.asarray(positions.coordinates(sought)))) == pytest.approx(
         sought, abs=1e-4

@@ -13,7 +13,6 @@ from stripes import build, halving, registered
 from benchmarks import _registry, _study
 from benchmarks._grid import to_rich
 from benchmarks.studies import robustness
-from benchmarks.studies.robustness import _cases
 
 
 def test_a_jpeg_is_as_far_off_as_its_level_says():
@@ -21,13 +20,13 @@ def test_a_jpeg_is_as_far_off_as_its_level_says():
     picture = np.repeat(grey, 3, axis=2)
     size = math.sqrt(np.mean(picture**2))
     for level in (0.02, 0.06, 0.14):
-        error = _cases.jpeg(picture, level)
+        error = robustness.jpeg(picture, level)
         assert math.sqrt(np.mean(error**2)) / size == pytest.approx(level, rel=0.1)
-    assert not _cases.jpeg(picture, 0).any()
+    assert not robustness.jpeg(picture, 0).any()
 
 
 def test_starts_anywhere_are_within_the_bounds():
-    task = _cases.anywhere(build(full=False))
+    task = robustness.anywhere(build(full=False))
     starts = np.stack([task.start(seed) for seed in range(50)])
     assert np.all((starts >= 0) & (starts <= 1))
     assert starts.std(axis=0) == pytest.approx(12**-0.5, rel=0.25)
@@ -36,17 +35,17 @@ def test_starts_anywhere_are_within_the_bounds():
 def test_a_compressed_reference_moves_the_residuals_and_the_loss():
     task = build(full=False)
     for level, moved in ((0, False), (0.14, True)):
-        changed = _cases.compressed(task, level)
-        off = _cases.residuals(changed.problem)(task.score.reference)
+        changed = robustness.compressed(task, level)
+        off = robustness.residuals(changed.problem)(task.score.reference)
         assert bool(np.asarray(off).any()) == moved
         found = changed.problem.loss(task.score.reference)
         assert float(found) == pytest.approx(float(jnp.mean(off**2)))
 
 
 def test_runs_are_scored_by_the_parameters():
-    task = _cases.scored(build(full=False))
+    task = robustness.scored(build(full=False))
     assert float(task.exact_loss(task.score.reference + 0.5)) == pytest.approx(0.5)
-    assert task.problem.budget == _cases.BUDGET
+    assert task.problem.budget == robustness.BUDGET
 
 
 def test_it_is_measured_drawn_and_resumed(tmp_path, monkeypatch, capsys):
@@ -54,12 +53,11 @@ def test_it_is_measured_drawn_and_resumed(tmp_path, monkeypatch, capsys):
     registered(monkeypatch, tasks={"stripes": usual}, methods={"halving": halving})
     monkeypatch.setattr(robustness, "SCENES", ("stripes",))
     monkeypatch.setattr(robustness, "STARTS", {"quick": (5, 2)})
-    for module in (robustness, _cases):
-        monkeypatch.setattr(module, "USUAL", ("halving",))
-    monkeypatch.setattr(_cases, "sampling", lambda number: [_registry.method("halving")])
+    monkeypatch.setattr(robustness, "USUAL", ("halving",))
+    monkeypatch.setattr(robustness, "sampling", lambda number: [_registry.method("halving")])
     values = {"spp": (1, 4), "jpeg": (0, 14), "samples": (4, 6)}
     for study, few in values.items():
-        monkeypatch.setattr(_cases, study.upper(), few)
+        monkeypatch.setattr(robustness, study.upper(), few)
     options = Namespace(said="the command", full=False, fresh=False)
     _study.run(robustness, options, tmp_path)
     assert "Robustness" in capsys.readouterr().out

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks import _study
 from benchmarks.studies import variance
-from benchmarks.studies.variance import descent, errors, estimators, fits, replicates, targets
+from benchmarks.studies.variance import costs, descent, errors, estimators, targets
 from benchmarks.studies.variance.problems import PROBLEMS
 
 
@@ -107,8 +107,8 @@ def test_a_fit_pays_where_it_takes_less_time_than_the_evaluations_it_spares():
     plain, fitted = ({"gradient": {int(n): at for n, at in curve(x).items()}} for x in (1, 0.5))
     found = {"sobol-mean": plain, "sobol-gp": fitted}
     ms = {"gradient, mean": 1.0, "gradient, gp": 1.64}
-    assert fits.pays_from(found, ms, 64, "gradient") == pytest.approx(10)
-    assert fits.pays_from(found | {"sobol-gp": plain}, ms, 64, "gradient") is None
+    assert costs.pays_from(found, ms, 64, "gradient") == pytest.approx(10)
+    assert costs.pays_from(found | {"sobol-gp": plain}, ms, 64, "gradient") is None
 
 
 def test_costs_to_a_level():
@@ -139,10 +139,9 @@ def test_a_whole_study_runs_writes_and_resumes(monkeypatch, tmp_path):
     monkeypatch.setattr(targets, "TARGETS", {})
     short = {k: setting._replace(evaluations=8) for k, setting in descent.SETTINGS.items()}
     monkeypatch.setattr(descent, "SETTINGS", short)
-    monkeypatch.setattr(fits, "SAMPLES", (16,))
-    monkeypatch.setattr(replicates, "SAMPLES", 16)
-    monkeypatch.setattr(replicates, "REPLICATES", (1, 2))
-    monkeypatch.setattr(replicates, "BASELINES", ("mean",))
+    monkeypatch.setattr(costs, "TIMED", (16,))
+    monkeypatch.setattr(costs, "SAMPLES", 16)
+    monkeypatch.setattr(costs, "REPLICATES", (1, 2))
     options = Namespace(said="a test", full=True, fresh=False)
     _study.run(variance, options, tmp_path)
     results = json.loads((tmp_path / "results.json").read_text())
@@ -150,7 +149,7 @@ def test_a_whole_study_runs_writes_and_resumes(monkeypatch, tmp_path):
     assert found["aggregate"]["hessian"]["8"]["evaluations"] == 8
     low, middle, high = found["sobol-mean"]["hvp"]["8"]["rmse"]
     assert 0 < low <= middle <= high
-    one, two = results["replicates"]
+    one, two, *_ = results["replicates"]
     assert one["RMSE over one set's"] == [1, 1, 1]
     assert two["sets"] == 2
     assert 0 <= two["coverage"][1] <= 1
@@ -160,8 +159,8 @@ def test_a_whole_study_runs_writes_and_resumes(monkeypatch, tmp_path):
         raise AssertionError("measured again")
 
     monkeypatch.setattr(errors, "_measure", measure_again)
-    monkeypatch.setattr(fits, "run", lambda *_: [])
-    monkeypatch.setattr(replicates, "run", lambda *_: [])
+    for name in ("fits", "replicates"):
+        monkeypatch.setattr(costs, name, lambda *_: [])
     again = variance.measure(options, tmp_path)["problems"]["box2"]["estimators"]
     assert again["sobol-mean"]["hvp"][8]["rmse"][1] == pytest.approx(middle, rel=1e-3)
     options.fresh = True

@@ -5,6 +5,7 @@ with it: a wide one sees over plateaus, a narrow one sees the minimum sharply.
 """
 
 import itertools
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -16,7 +17,7 @@ from benchmarks._task import MethodEntry, Problem, Solve
 from benchmarks.methods._flat import Flat, package
 
 # optimistix
-WIDEST, NARROWEST, SHRINK = 2.0, 1e-4, 0.2  # widths of the differences, in units of sigma
+WIDTHS = [max(2.0 * 0.2**i, 1e-4) for i in range(8)]  # of the differences, in units of sigma
 TOLERANCE = 0.01  # of a step of BFGS, in units of the width
 MOST = 300  # steps of BFGS with one width
 TAGS = frozenset()
@@ -57,37 +58,20 @@ def on_differences(problem: Problem) -> Solve:
         return loss(u, width) / unit, None
 
     solver = lambda width: optx.BFGS(rtol=0.0, atol=TOLERANCE * width)
-
-    @jax.jit
-    def slope(u, width):
-        size = jnp.linalg.norm(differences(u, width))
-        return jnp.where(size > 0, size, 1)
+    slope = jax.jit(lambda u, width, key: jnp.linalg.norm(differences(u, width)))
 
     @eqx.filter_jit
-    def init(u, args):
+    def init(u, width, key, unit):
         number = jax.ShapeDtypeStruct((), flat.dtype)
-        return solver(args[0]).init(fun, u, args, {}, number, None, TAGS)
+        return solver(width).init(fun, u, (width, unit), {}, number, None, TAGS)
 
     @eqx.filter_jit
-    def step(u, args, state):
-        u, state, _ = solver(args[0]).step(fun, u, args, {}, state, TAGS)
-        return u, state, solver(args[0]).terminate(fun, u, args, {}, state, TAGS)[0]
+    def step(u, state, width, key, unit):
+        args = width, unit
+        u, state, _ = solver(width).step(fun, u, args, {}, state, TAGS)
+        return u, state, solver(width).terminate(fun, u, args, {}, state, TAGS)[0]
 
-    def solve(y0, key, record):
-        u = jnp.asarray(flat.start(y0) / sigma, flat.dtype)
-        for shrink in itertools.accumulate(itertools.repeat(SHRINK), lambda a, b: a * b):
-            width = jnp.asarray(max(WIDEST * shrink / SHRINK, NARROWEST), flat.dtype)
-            args = width, slope(u, width)
-            state = init(u, args)
-            for _ in range(MOST):
-                u, state, done = step(u, args, state)
-                record(flat.tree(sigma * u))
-                if done:
-                    break
-            if width <= NARROWEST:
-                return
-
-    return solve
+    return rounds(flat, lambda: WIDTHS, slope, init, step, MOST)
 
 
 def on_a_smoothed_loss(problem: Problem) -> Solve:
@@ -98,7 +82,7 @@ def on_a_smoothed_loss(problem: Problem) -> Solve:
     jaxopt = package("jaxopt", "jaxopt")
     flat = Flat(problem)
 
-    def fun(u, key, sigma, unit):
+    def fun(u, sigma, key, unit):
         smoothed = sd.smooth(
             lambda u: flat.loss(problem.sigma * u),
             sigma,
@@ -109,23 +93,37 @@ def on_a_smoothed_loss(problem: Problem) -> Solve:
         return smoothed(key, u) / unit
 
     solver = jaxopt.LBFGS(fun, linesearch="zoom", maxls=10)
-    init = jax.jit(solver.init_state)
-    step = jax.jit(solver.update)
+    update = jax.jit(solver.update)
     slope = jax.jit(lambda *args: jnp.linalg.norm(jax.grad(fun)(*args, jnp.ones((), flat.dtype))))
 
+    def step(u, state, *args):
+        u, state = update(u, state, *args)
+        return flat.clip(problem.sigma * u) / problem.sigma, state, state.error <= SLOPE_END
+
+    sigmas = lambda: (max(SIGMA_SHRINK**i, SIGMA_END) for i in itertools.count())
+    return rounds(flat, sigmas, slope, jax.jit(solver.init_state), step, STEPS)
+
+
+def rounds(
+    flat: Flat, widths: Callable, slope: Callable, init: Callable, step: Callable, most: int
+) -> Solve:
+    """A search with each of `widths()` from where the last one ended, of so many steps at most.
+
+    All take the width, a key of the round, and the size of the first slope, which is the unit.
+    """
+    sigma = flat.problem.sigma
+
     def solve(y0, key, record):
-        u = jnp.asarray(flat.start(y0) / problem.sigma, flat.dtype)
-        for i in itertools.count():
-            sigma = jnp.asarray(max(SIGMA_SHRINK**i, SIGMA_END), flat.dtype)
-            args = jax.random.fold_in(key, i), sigma
-            unit = slope(u, *args)
-            args += (jnp.where(unit > 0, unit, 1),)
+        u = jnp.asarray(flat.start(y0) / sigma, flat.dtype)
+        for i, width in enumerate(widths()):
+            looks = jnp.asarray(width, flat.dtype), jax.random.fold_in(key, i)
+            unit = slope(u, *looks)
+            args = *looks, jnp.where(unit > 0, unit, 1)
             state = init(u, *args)
-            for _ in range(STEPS):
-                u, state = step(u, state, *args)
-                u = flat.clip(problem.sigma * u) / problem.sigma
-                record(flat.tree(problem.sigma * u))
-                if state.error <= SLOPE_END:
+            for _ in range(most):
+                u, state, done = step(u, state, *args)
+                record(flat.tree(sigma * u))
+                if done:
                     break
 
     return solve

@@ -65,9 +65,7 @@ class Rendered(NamedTuple):
 class Solvers:
     """A solver for each case, and what all cases learn from their renders.
 
-    Args:
-        grey: The loss in two parts.
-        answer: What the network says of a picture, for its shape.
+    It is told what the network says of a picture, for its shape.
     """
 
     def __init__(self, grey: Grey, answer: jax.Array):

@@ -7,7 +7,7 @@ and falls linearly (appendix L) with the evaluations used. The aggregate sampler
 the table has it for Box2 and Box10: with two it finds little. Nothing is subtracted.
 
 OurG is the importance-sampled gradient (eq. 17) with Adam, the same as for all first-order methods
-here. OurH, OurHVP and OurHVPA are conjugate gradients, by what gives the product with v.
+here. OurHVPA is conjugate gradients with sampled products with v.
 
 $$ \\varepsilon = -\\frac{g \\cdot v}{v \\cdot H v}, \\quad x \\mathrel{+}= \\varepsilon v, \\quad
    r' = -g(x), \\quad \\beta = \\frac{r' \\cdot r'}{r \\cdot r}, \\quad v = r' + \\beta v $$
@@ -19,70 +19,23 @@ edge of the region, downhill, as a Newton step does with the Hessian modified to
 """
 
 import itertools
-from collections.abc import Callable
-from functools import partial
-from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 import smoothdiff as sd
 from benchmarks._task import MethodEntry, Problem, Solve
-from benchmarks.methods._adam import adam
 from benchmarks.methods._flat import Flat
+from benchmarks.methods.adam import adam
 
 PER_ELEMENT = 4  # samples
 AGGREGATE = 12  # samples for all elements together
 SIGMA_END = 0.02  # of the problem's sigma
 SHIFT = 1 / 3  # epsilon |v| of eq. 8, in units of sigma, as in the authors' code
-# the medians of table 3: OurH, OurHVP and OurHVPA, with ten entries read as nine
-RADIUS = {"hessian": 3.0, "product": 4.0, "aggregate": 4.0}  # of the trust region, in sigma
-LINE_SEARCH = {"hessian": 2, "product": 2, "aggregate": 3}  # steps along a line
+RADIUS = 4.0  # of the trust region, in sigma; this and the next are the medians of table 3
+LINE_SEARCH = 3  # steps along a line
 TOLERANCE = 1e-3  # of a step along a line, in sigma
 RECOMPUTE = 10  # iterations after which v starts again
-
-Kind = Literal["hessian", "product", "aggregate"]
-
-
-class Derivative(NamedTuple):
-    """A derivative of the smoothed loss of a flat vector, compiled, and what it costs."""
-
-    call: Callable[..., jax.Array]
-    evaluations: int
-
-
-def sampled_gradient(flat: Flat, *, aggregate: bool) -> Derivative:
-    """`(key, sigma, x) -> vector`, eq. 17: elementwise or aggregate importance sampling."""
-    call = jax.jit(lambda key, sigma, x: _smooth_grad(flat, sigma, aggregate)(key, x))
-    return Derivative(call, AGGREGATE if aggregate else PER_ELEMENT * flat.size)
-
-
-def gradient_difference(flat: Flat, *, aggregate: bool) -> Derivative:
-    """`(key, sigma, x, v) -> vector`, eq. 8 and 23: the difference of two sampled gradients.
-
-    Both see the same random numbers; drawn independently, their difference is noise.
-    """
-
-    @jax.jit
-    def call(key, sigma, x, v):
-        grad = _smooth_grad(flat, sigma, aggregate)
-        length = jnp.maximum(jnp.linalg.norm(v), jnp.finfo(v.dtype).tiny)
-        along = sd.difference_hvp(grad, SHIFT)(key, x, v * (sigma / length))
-        return along * (length / sigma)
-
-    return Derivative(call, 2 * sampled_gradient(flat, aggregate=aggregate).evaluations)
-
-
-def hessian_product(flat: Flat) -> Derivative:
-    """The same by a Hessian, eq. 20, elementwise: n (n + 1) / 2 sets of samples."""
-
-    @jax.jit
-    def call(key, sigma, x, v):
-        sampler = sd.Importance(2)
-        options = {"num_samples": PER_ELEMENT, "sampler": sampler, "baseline": "none"}
-        return jnp.matmul(sd.smooth_hessian(flat.loss, sigma, **options)(key, x), v)
-
-    return Derivative(call, PER_ELEMENT * flat.size * (flat.size + 1) // 2)
 
 
 def sigma_at(flat: Flat, evaluations: int) -> jax.Array:
@@ -91,21 +44,38 @@ def sigma_at(flat: Flat, evaluations: int) -> jax.Array:
     return jnp.asarray(flat.problem.sigma * (1 - (1 - SIGMA_END) * used), flat.dtype)
 
 
-def _smooth_grad(flat: Flat, sigma: jax.Array, aggregate: bool) -> Callable:
-    if aggregate:
-        num_samples, sampler = AGGREGATE, sd.Aggregate(1, share=0.0)
-    else:
-        num_samples, sampler = PER_ELEMENT, sd.Importance(1)
-    options = {"num_samples": num_samples, "sampler": sampler, "baseline": "none"}
-    return sd.smooth_grad(flat.loss, sigma, **options)
-
-
 def our_gradient(problem: Problem) -> Solve:
     """A set of samples for each parameter."""
     flat = Flat(problem)
-    call, evaluations = sampled_gradient(flat, aggregate=False)
-    gradient = lambda key, i, x: call(key, sigma_at(flat, i * evaluations), x)
+    evaluations = PER_ELEMENT * flat.size
+    options = {"num_samples": PER_ELEMENT, "sampler": sd.Importance(1), "baseline": "none"}
+    slope = jax.jit(lambda key, sigma, x: sd.smooth_grad(flat.loss, sigma, **options)(key, x))
+    gradient = lambda key, i, x: slope(key, sigma_at(flat, i * evaluations), x)
     return adam(flat, gradient, evaluations)
+
+
+class Aggregate:
+    """Derivatives of the smoothed loss of a flat vector by the aggregate sampler, compiled.
+
+    Attributes:
+        gradient: `(key, sigma, x) -> vector`, eq. 17.
+        product: `(key, sigma, x, v) -> vector`, eq. 8 and 23: the difference of two gradients, that
+            see the same random numbers; drawn independently, their difference is noise.
+    """
+
+    def __init__(self, flat: Flat):
+        sampler = sd.Aggregate(1, share=0.0)
+        options = {"num_samples": AGGREGATE, "sampler": sampler, "baseline": "none"}
+        smooth_grad = lambda sigma: sd.smooth_grad(flat.loss, sigma, **options)
+
+        @jax.jit
+        def product(key, sigma, x, v):
+            length = jnp.maximum(jnp.linalg.norm(v), jnp.finfo(v.dtype).tiny)
+            shifted = sd.difference_hvp(smooth_grad(sigma), SHIFT)
+            return shifted(key, x, v * (sigma / length)) * (length / sigma)
+
+        self.gradient = jax.jit(lambda key, sigma, x: smooth_grad(sigma)(key, x))
+        self.product = product
 
 
 @jax.jit
@@ -128,32 +98,28 @@ def _turn(r, v, new, restart):
     return jnp.where(restart | (jnp.vdot(new, v) <= 0), new, v)
 
 
-def conjugate_gradients(problem: Problem, kind: Kind) -> Solve:
+def conjugate_gradients(problem: Problem) -> Solve:
     """Compiles the derivatives; the loop runs on the host, as the line search may end early."""
-    flat, aggregate = Flat(problem), kind == "aggregate"
-    gradient = sampled_gradient(flat, aggregate=aggregate)
-    if kind == "hessian":
-        product = hessian_product(flat)
-    else:
-        product = gradient_difference(flat, aggregate=aggregate)
+    flat = Flat(problem)
+    of = Aggregate(flat)
 
     def solve(y0, key, record):
         keys = (jax.random.fold_in(key, i) for i in itertools.count())
         x = jnp.asarray(flat.start(y0), flat.dtype)
         sigma = sigma_at(flat, 0)
-        r = v = -gradient.call(next(keys), sigma, x)
-        used = gradient.evaluations
+        r = v = -of.gradient(next(keys), sigma, x)
+        used = AGGREGATE
         for i in itertools.count(1):
             sigma = sigma_at(flat, used)
-            for _ in range(LINE_SEARCH[kind]):
-                g = gradient.call(next(keys), sigma, x)
-                hv = product.call(next(keys), sigma, x, v)
-                used += gradient.evaluations + product.evaluations
-                x, moved = _move(x, v, g, hv, RADIUS[kind] * sigma, flat.low, flat.high)
+            for _ in range(LINE_SEARCH):
+                g = of.gradient(next(keys), sigma, x)
+                hv = of.product(next(keys), sigma, x, v)
+                used += 3 * AGGREGATE
+                x, moved = _move(x, v, g, hv, RADIUS * sigma, flat.low, flat.high)
                 if moved <= TOLERANCE * sigma:
                     break
-            new = -gradient.call(next(keys), sigma, x)
-            used += gradient.evaluations
+            new = -of.gradient(next(keys), sigma, x)
+            used += AGGREGATE
             r, v = new, _turn(r, v, new, i % RECOMPUTE == 0)
             record(flat.tree(x))
 
@@ -164,15 +130,9 @@ METHODS = {
     "our_gradient": MethodEntry(
         "Importance-sampled gradient, Adam (OurG)", ("scene",), our_gradient
     ),
-    "our_h": MethodEntry(
-        "Conjugate gradients, Hessian (OurH)", (), partial(conjugate_gradients, kind="hessian")
-    ),
-    "our_hvp": MethodEntry(
-        "Conjugate gradients, product (OurHVP)", (), partial(conjugate_gradients, kind="product")
-    ),
     "our_hvpa": MethodEntry(
         "Conjugate gradients, aggregate (OurHVPA)",
         ("scene", "large", "function"),
-        partial(conjugate_gradients, kind="aggregate"),
+        conjugate_gradients,
     ),
 }

@@ -31,15 +31,7 @@ def value_and_grad(
 ) -> NativeAD:
     """`y -> (loss, gradient)`, not to be traced by JAX; each y has other noise.
 
-    Args:
-        scene: As for `picture`.
-        params: Likewise.
-        integrator: One that knows of edges that move, such as `direct_projective`.
-        photo: The picture to be matched.
-        spp: Samples per pixel.
-
-    Raises:
-        NotAble: Where Mitsuba has no variant with AD.
+    The integrator is one that knows of edges that move, such as `direct_projective`.
     """
     if not mitsuba.available(VARIANT):
         raise NotAble(f"needs libllvm >= 17, for Mitsuba's variant {VARIANT}")

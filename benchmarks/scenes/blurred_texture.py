@@ -11,21 +11,11 @@ PIXELS = 32
 RADIUS = 2  # how far a texel reaches, in pixels
 LEVELS = 16  # of grey in the picture, from 0 to 1
 START = np.full((PIXELS, PIXELS), 0.5)
-
-
-def _blur() -> np.ndarray:
-    kernel = np.array([1, 4, 6, 4, 1]) / 16
-    rows = np.sum([w * np.eye(PIXELS, k=k - RADIUS) for k, w in enumerate(kernel)], axis=0)
-    return rows / rows.sum(axis=1, keepdims=True)
-
-
-def _waves() -> np.ndarray:
-    y, x = np.mgrid[0:PIXELS, 0:PIXELS] / PIXELS
-    return 0.5 + 0.4 * np.sin(2 * np.pi * (x + 2 * y)) * np.cos(6 * np.pi * (x - 0.5) * y)
-
-
-BLUR = _blur()  # a line of pixels from a line of texels
-REFERENCE = _waves()
+KERNEL = np.array([1, 4, 6, 4, 1]) / 16
+NEAR = np.sum([w * np.eye(PIXELS, k=k - RADIUS) for k, w in enumerate(KERNEL)], axis=0)
+BLUR = NEAR / NEAR.sum(axis=1, keepdims=True)  # a line of pixels from a line of texels
+Y, X = np.mgrid[0:PIXELS, 0:PIXELS] / PIXELS
+REFERENCE = 0.5 + 0.4 * np.sin(2 * np.pi * (X + 2 * Y)) * np.cos(6 * np.pi * (X - 0.5) * Y)
 
 
 def blurred(texture: Float[Array, "32 32"]) -> Float[Array, "32 32"]:

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from benchmarks.scenes.meshes import Faces
+from benchmarks.scenes.meshes import Faces, sides_of, spiral
 from smoothdiff.filters._triangles import vertex_normals
 
 LIGHTS = np.array([[1.0, 0.6, 0.3], [-0.5, 0.9, -0.6], [-0.4, -0.8, 0.7], [0.5, -0.4, -0.9]])
@@ -51,10 +51,7 @@ class Edges(NamedTuple):
 
 def views_around(number: int, size: int, samples: int = 2) -> Views:
     """Views from directions that are spread evenly over the sphere."""
-    k = np.arange(number) + 0.5
-    z, angle = 1 - 2 * k / number, np.pi * (1 + 5**0.5) * k
-    radius = np.sqrt(1 - z**2)
-    away = -np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+    away = -spiral(number)[0]
     helper = np.where(abs(away[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[0.0, 1.0, 0.0]])
     right = np.cross(away, helper)
     right /= np.linalg.norm(right, axis=1, keepdims=True)
@@ -63,12 +60,10 @@ def views_around(number: int, size: int, samples: int = 2) -> Views:
 
 def edges_of(faces: Faces) -> Edges:
     """The edges of a closed mesh, each once."""
-    sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
-    _, first, which = np.unique(
-        np.sort(sides, axis=1), axis=0, return_index=True, return_inverse=True
-    )
+    sides = sides_of(faces)
+    _, which = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True)
     order = np.argsort(which, kind="stable").reshape(-1, 2)  # each edge has two sides
-    return Edges(sides[first].astype(np.int32), (order // 3).astype(np.int32))
+    return Edges(sides[order[:, 0]].astype(np.int32), (order // 3).astype(np.int32))
 
 
 def render(
@@ -95,8 +90,7 @@ def render(
     hit, depth = _visible(jax.lax.stop_gradient(screen), faces, size)
     picture = _interpolate(screen, colours, faces, hit)
     picture += _silhouettes(screen, colours, faces, edges, picture, depth, along, shift[:, None])
-    pixels = picture.reshape(number, views.size, views.samples, views.size, views.samples, 3)
-    return jnp.mean(pixels, axis=(2, 4))
+    return _pixels(picture, views)
 
 
 def look(
@@ -115,14 +109,18 @@ def look(
         size = views.size * views.samples
         screen = _project(positions, views, size) - jnp.array([[[0.5, 0.5, 0.0]]], positions.dtype)
         hit, _ = _visible(screen, faces, size)
-        picture = _interpolate(screen, colours, faces, hit)
-        pixels = picture.reshape(-1, views.size, views.samples, views.size, views.samples, 3)
-        return jnp.mean(pixels, axis=(2, 4))
+        return _pixels(_interpolate(screen, colours, faces, hit), views)
 
     colours = _shade(vertex_normals(positions, faces))
     if albedo is not None:
         colours = albedo * jnp.mean(colours, axis=1, keepdims=True)
     return one(positions, colours)
+
+
+def _pixels(picture: Array, views: Views) -> Array:
+    """The means of the samples of each pixel."""
+    samples = picture.reshape(-1, views.size, views.samples, views.size, views.samples, 3)
+    return jnp.mean(samples, axis=(2, 4))
 
 
 def _project(positions: Array, views: Views, size: int) -> Array:
@@ -161,18 +159,13 @@ def _visible(screen: Array, faces: Faces, size: int) -> tuple[Array, Array]:
     counts = spans[:, 0] * spans[:, 1]
     ends = jnp.cumsum(counts, dtype=jnp.int32)
     begins = ends - counts
-    stretch = number * size**2
-    samples = number * size**2
+    stretch = samples = number * size**2
 
     def take(carry):
         start, hit, depth = carry
         places = start + jnp.arange(stretch, dtype=jnp.int32)
-        marks = (
-            jnp.zeros(stretch, jnp.int32)
-            .at[jnp.maximum(begins - start, 0)]
-            .max(jnp.arange(total, dtype=jnp.int32), mode="drop")
-        )
-        triangle = jax.lax.cummax(marks)
+        marks = jnp.zeros(stretch, jnp.int32).at[jnp.maximum(begins - start, 0)]
+        triangle = jax.lax.cummax(marks.max(jnp.arange(total, dtype=jnp.int32), mode="drop"))
         inside_box = places - begins[triangle]
         width = jnp.maximum(spans[triangle, 0], 1)
         x: Array = low[triangle, 0] + inside_box % width
@@ -238,15 +231,11 @@ def _silhouettes(
     outwards = sign * jnp.stack([-side[..., 1], side[..., 0]], axis=-1)  # as long as the edge
     length = jnp.maximum(jnp.linalg.norm(side, axis=-1, keepdims=True), 1e-9)
     behind = _index(jnp.round(point[..., :2] + outwards / length), size)
-    outside = jnp.where(
-        (behind < samples)[..., None],
-        jnp.take_along_axis(
-            jax.lax.stop_gradient(picture), jnp.minimum(behind, samples - 1)[..., None], axis=1
-        ),
-        BACKGROUND,
-    )
-    beyond = jnp.take_along_axis(depth, jnp.minimum(behind, samples - 1), axis=1)
-    visible = (one != other) & ((beyond > point[..., 2]) | (behind >= samples))
+    at, within = jnp.minimum(behind, samples - 1), behind < samples
+    there = jnp.take_along_axis(jax.lax.stop_gradient(picture), at[..., None], axis=1)
+    outside = jnp.where(within[..., None], there, BACKGROUND)
+    beyond = jnp.take_along_axis(depth, at, axis=1)
+    visible = (one != other) & ((beyond > point[..., 2]) | ~within)
     ends = jax.lax.stop_gradient(colours)[edges.ends]
     inside = ends[None, :, 0] + along[..., None] * (ends[:, 1] - ends[:, 0])[None]
     jump = jnp.where(visible[..., None], inside - outside, 0)

@@ -33,12 +33,17 @@ def icosphere(level: int) -> tuple[Positions, Faces]:
 
 
 def ball(vertices: int) -> tuple[Positions, Faces]:
-    """A unit sphere of any number of vertices, on a spiral."""
-    k = np.arange(vertices) + 0.5
-    z, angle = 1 - 2 * k / vertices, np.pi * (1 + 5**0.5) * k
-    radius = np.sqrt(1 - z**2)
-    positions = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+    """A unit sphere of any number of vertices."""
+    positions, _ = spiral(vertices)
     return positions, _outwards(positions, ConvexHull(positions).simplices)
+
+
+def spiral(number: int) -> tuple[Positions, Float[np.ndarray, " vertices"]]:
+    """Directions that are spread evenly over the sphere (a Fibonacci lattice); their longitudes."""
+    k = np.arange(number) + 0.5
+    z, angle = 1 - 2 * k / number, np.pi * (1 + 5**0.5) * k
+    radius = np.sqrt(1 - z**2)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1), angle
 
 
 def cube(cells: int) -> tuple[Positions, Faces]:
@@ -100,10 +105,14 @@ def _outwards(positions: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.where(clockwise[:, None], faces[:, ::-1], faces)
 
 
+def sides_of(faces: Faces) -> Int[np.ndarray, "sides 2"]:
+    """The vertices at the three sides of each face, one after the other."""
+    return np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
+
+
 def _cut_into_four(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The middle of each side becomes a vertex."""
-    sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
-    ends, middles = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True)
+    ends, middles = np.unique(np.sort(sides_of(faces), axis=1), axis=0, return_inverse=True)
     a, b, c = faces.T
     ab, bc, ca = middles.reshape(-1, 3).T + len(positions)
     parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]

@@ -14,6 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from benchmarks.scenes import _monte_carlo
+from benchmarks.scenes._monte_carlo import mean_of
+
 REFLECTANCE: Any = np.array([[[0.95, 0.79, 0.55]]])  # of the metal at normal incidence, linear RGB
 LOW, HIGH = 0.05, 1.0  # of the roughness; GGX's alpha is its square
 CAMERA = np.array([[[0.0, -1.6, 2.2]]])  # the plate is [-1, 1]² in the plane z = 0
@@ -62,30 +65,19 @@ def shade(roughness: Texture, jitter: Float[Array, "h w 2"], point: Float[Array,
 
 def render(roughness: Texture, key: Array, samples: int) -> Image:
     """The mean of so many samples a pixel."""
-    shape = (*roughness.shape, 2)
-
-    def add(image: Image, key: Array) -> tuple[Image, None]:
-        jitter, point = jax.random.uniform(key, (2, *shape), roughness.dtype)
-        return image + shade(roughness, jitter, point), None
-
-    keys = jax.random.split(key, samples)
-    image, _ = jax.lax.scan(add, jnp.zeros((*roughness.shape, 3), roughness.dtype), keys)
-    return image / samples
+    numbers = lambda key: jax.random.uniform(key, (2, *roughness.shape, 2), roughness.dtype)
+    sample = lambda key: shade(roughness, *numbers(key))
+    return mean_of(sample, jax.random.split(key, samples))
 
 
 def gradient(
     roughness: Texture, key: Array, reference: Image, *, primal: int, samples: int
 ) -> Texture:
-    """The gradient of `loss`, unbiased: picture and derivative have samples of their own."""
+    """The gradient of the loss, unbiased: picture and derivative have samples of their own."""
     key_primal, key_derivative = jax.random.split(key)
-    residual = render(roughness, key_primal, primal) - reference
-    _, pull = jax.vjp(lambda y: render(y, key_derivative, samples), roughness)
-    return pull(2 * residual / 3)[0]
-
-
-def loss(image: Image, reference: Image) -> Float[Array, ""]:
-    """The squared error of a picture, the mean over the channels and the sum over the pixels."""
-    return jnp.sum((image - reference) ** 2) / 3
+    seen = render(roughness, key_primal, primal)
+    sample = lambda y: render(y, key_derivative, samples)
+    return _monte_carlo.gradient(sample, roughness, seen, reference)
 
 
 @partial(jax.jit, static_argnames="samples")
@@ -95,13 +87,8 @@ def exact(roughness: Texture, samples: int) -> Image:
     shift = jax.random.uniform(jax.random.key(0), shape, roughness.dtype)
     middle = jnp.full(shape, 0.5, roughness.dtype)
     sequence = np.outer(np.arange(samples), [0.7548776662, 0.5698402910]) % 1  # Roberts' R2
-
-    def add(image: Image, point: Float[Array, " 2"]) -> tuple[Image, None]:
-        return image + shade(roughness, middle, (shift + point[None, None]) % 1), None
-
-    zero = jnp.zeros((*roughness.shape, 3), roughness.dtype)
-    image, _ = jax.lax.scan(add, zero, jnp.asarray(sequence, roughness.dtype))
-    return image / samples
+    sample = lambda point: shade(roughness, middle, (shift + point[None, None]) % 1)
+    return mean_of(sample, jnp.asarray(sequence, roughness.dtype))
 
 
 def texture(size: int) -> np.ndarray:

@@ -58,15 +58,9 @@ def scene(world: Any) -> Description:
 
 
 def make(resolution: int, spp: int, variant: str = VARIANT) -> tuple[Picture, np.ndarray]:
-    """The render function and the reference image.
+    """`render(y)`, a black box, and the image at `REFERENCE` with many samples and other noise.
 
-    Args:
-        resolution: Pixels along a side; 32 is quick, 64 is the full task.
-        spp: Samples per pixel; 4 are enough.
-        variant: Mitsuba variant.
-
-    Returns:
-        `render(y)`, a black box, and the image at `REFERENCE` with many samples and other noise.
+    A side of the picture has 32 pixels, or 64 in the full task; four samples of each are enough.
     """
     render = picture(scene, PARAMS, variant, resolution=resolution, spp=spp)
     photograph = picture(scene, PARAMS, variant, resolution=resolution, spp=256, seed=1)

@@ -14,6 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from benchmarks.scenes import _monte_carlo
+from benchmarks.scenes._monte_carlo import mean_of
+from benchmarks.scenes.meshes import spiral
+
 BACKGROUND = 1.0
 DENSEST = 8.0  # absorption per unit of length of a density of 1; the volume is [-1, 1]³
 REACH = 1.5  # a ray is marched from -REACH to REACH around the point nearest to the middle
@@ -37,11 +41,9 @@ class Camera(NamedTuple):
 
 
 def cameras(views: int) -> Camera:
-    """Directions that are spread evenly over the sphere (a Fibonacci lattice)."""
-    index = np.arange(views) + 0.5
-    height, angle = 1 - 2 * index / views, np.pi * (1 + np.sqrt(5)) * index
-    flat = np.sqrt(1 - height**2)
-    forward = -np.stack([flat * np.cos(angle), flat * np.sin(angle), height], -1)
+    """From directions that are spread evenly over the sphere."""
+    directions, angle = spiral(views)
+    forward = -directions
     right = np.stack([-np.sin(angle), np.cos(angle), np.zeros(views)], -1)
     up = np.cross(right, forward)
     return Camera(*(jnp.asarray(each, jnp.float32) for each in (forward, right, up)))
@@ -52,28 +54,17 @@ def render(
     volume: Volume, camera: Camera, key: Array, *, pixels: int, steps: int, samples: int
 ) -> Image:
     """The mean of so many rays a pixel, each with the colour of all that it passes."""
-
-    def add(image: Image, key: Array) -> tuple[Image, None]:
-        ray = _march(volume, camera, key, pixels, steps)
-        return image + _whole_colour(volume, ray), None
-
-    keys = jax.random.split(key, samples)
-    image, _ = jax.lax.scan(add, jnp.zeros((camera.forward.shape[0], pixels, pixels, 3)), keys)
-    return image / samples
+    sample = lambda key: _whole_colour(volume, _march(volume, camera, key, pixels, steps))
+    return mean_of(sample, jax.random.split(key, samples))
 
 
 def gradient(
     volume: Volume, camera: Camera, reference: Image, key: Array, *, steps: int, clean: bool
 ) -> Volume:
-    """The gradient of `loss`, unbiased: picture and derivative have rays of their own.
+    """The gradient of the loss, unbiased: picture and derivative have rays of their own.
 
-    Args:
-        volume: The parameters.
-        camera: The views.
-        reference: What is to be seen.
-        key: Decides the rays and the places.
-        steps: Of a ray.
-        clean: Ask a ray for the colour of all that it passes, not of one place drawn along it.
+    If it is `clean` a ray is asked for the colour of all that it passes, not of one place drawn
+    along it.
     """
     key_primal, key_ray, key_place = jax.random.split(key, 3)
     pixels = reference.shape[1]
@@ -83,13 +74,7 @@ def gradient(
         ray = _march(volume, camera, key_ray, pixels, steps)
         return _whole_colour(volume, ray) if clean else _one_colour(volume, ray, key_place)
 
-    _, pull = jax.vjp(sample, volume)
-    return pull(2 * (seen - reference) / 3)[0]
-
-
-def loss(images: Image, references: Image) -> Float[Array, ""]:
-    """The squared error of pictures, the mean over the channels and the sum over the pixels."""
-    return jnp.sum((images - references) ** 2) / 3
+    return _monte_carlo.gradient(sample, volume, seen, reference)
 
 
 class _Ray(NamedTuple):

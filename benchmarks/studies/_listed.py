@@ -1,9 +1,13 @@
-"""A table of results that are a list of lines: what a line calls its values are the columns."""
+"""Results that are a list of lines: as a table, and as dots against what they may be at most."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from benchmarks._grid import Grid, Row
+from benchmarks._style import COLOURS, figure
 
 
 def listed(
@@ -14,6 +18,26 @@ def listed(
     rows = (tuple(map(_cell, line.values())) for line in shown)
     columns = tuple(shown[0]) if shown else ("",)
     return Grid(title, caption, columns, tuple(Row(r[0], r[1:]) for r in rows), numbers)
+
+
+def dots(
+    path: Path, rows: Mapping[str, Sequence[float]], most: float, label: str, span: tuple
+) -> None:
+    """A row of dots for each name, beside a line at what they may be at most.
+
+    What is beyond the ends of the axis is drawn there. The axis is logarithmic if it is long.
+    """
+    with figure(path, 1, 1, (8, 0.26 * len(rows) + 1)) as (_, axes):
+        axis = axes[0, 0]
+        for place, values in enumerate(rows.values()):
+            colours = [COLOURS[1] if value <= most else COLOURS[0] for value in values]
+            shown = np.clip(values, *span)
+            axis.hlines(place, shown.min(), shown.max(), color="0.8", lw=2, zorder=1)
+            axis.scatter(shown, [place] * len(values), s=16, c=colours, alpha=0.6, lw=0)
+        axis.axvline(most, color="0.3", lw=0.8)
+        axis.set_xscale("log" if span[1] > 10 * span[0] else "linear")
+        axis.set(xlim=(span[0] / 1.1, span[1] * 1.1), xlabel=label)
+        axis.set(yticks=range(len(rows)), yticklabels=rows, ylim=(len(rows) - 0.4, -0.6))
 
 
 def _cell(value: Any) -> str:

@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks._grid import Grid
-from benchmarks._style import COLOURS, figure
-from benchmarks._timing import in_turns
-from benchmarks.studies._listed import listed
+from benchmarks._summary import quarters
+from benchmarks._timing import compiled
+from benchmarks.studies._listed import dots, listed
 from smoothdiff import filters
 
 HELP = "time of filters against moving their bytes"
@@ -45,10 +45,8 @@ def functions(ndim: int) -> dict[str, Callable]:
 
 def seconds(space: tuple[int, ...], channels: int) -> dict[str, np.ndarray]:
     """Seconds of each function in each turn."""
-    signal, guide = jax.random.normal(jax.random.key(0), (2, *space, channels))
-    jitted = {name: jax.jit(fun) for name, fun in functions(len(space)).items()}
-    calls = {name: lambda _, fun=fun: fun(signal, guide) for name, fun in jitted.items()}
-    return in_turns(calls, TURNS)
+    both = tuple(jax.random.normal(jax.random.key(0), (2, *space, channels)))
+    return compiled(functions(len(space)), lambda _: both, TURNS)
 
 
 def measure(options: Namespace, folder: Path) -> dict[str, Any]:
@@ -72,7 +70,7 @@ def measure(options: Namespace, folder: Path) -> dict[str, Any]:
                     "size": size,
                     "filter": name,
                     "GB/s": 1e-9 * float(bandwidth[size]),
-                    "ratio": np.quantile(found[name] / floor, [0.25, 0.5, 0.75]).tolist(),
+                    "ratio": quarters(found[name] / floor),
                     "ms": 1e3 * np.median(found[name]).item(),
                     "ms of floor": 1e3 * float(floor),
                     "ms of exponentials": exponentials if name == "cross_bilateral" else None,
@@ -92,21 +90,7 @@ def tables(results: dict[str, Any]) -> Iterator[Grid]:
 
 
 def draw(results: dict[str, Any], folder: Path) -> None:
-    """Times beside what moving the bytes takes, a panel for each filter."""
-    target = results["target"]
-    mark: dict[str, Any] = {"marker": "|", "ls": "", "ms": 12}
-    with figure(folder / "filters.png", 1, 2, (8, 3.6)) as (drawn, axes):
-        for axis, name, colour in zip(axes[0], MOVED, COLOURS, strict=False):
-            lines = [line for line in results["lines"] if line["filter"] == name]
-            column = lambda key, lines=lines: np.array([line[key] for line in lines], float)
-            times, floors, places = column("ms"), column("ms of floor"), np.arange(len(lines))
-            axis.hlines(places, floors, times, color="0.8", lw=2, zorder=1)
-            axis.plot(floors, places, **mark, mew=2, color="0.4", label="memory traffic")
-            axis.plot(target * floors, places, **mark, color="0.7", label=f"{target:.0f} times")
-            alone = column("ms of exponentials")  # of one filter; else NaN, which is not drawn
-            axis.plot(alone, places, "x", color=COLOURS[2], label="exponentials alone")
-            axis.plot(times, places, "o", color=colour, label="filter")
-            axis.set(xscale="log", xlabel="Milliseconds", title=name, yticks=places)
-            axis.set_yticklabels([line["size"] for line in lines] if axis is axes[0, 0] else [])
-            axis.invert_yaxis()
-        drawn.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    """Ratios with their quartiles."""
+    rows = {f"{line['filter']}, {line['size']}": line["ratio"] for line in results["lines"]}
+    label = "Time over that of moving the bytes; the target is a line"
+    dots(folder / "filters.png", rows, results["target"], label, (1, 300))

@@ -16,9 +16,9 @@ from jaxtyping import Array
 
 import smoothdiff as sd
 from benchmarks._grid import Grid
-from benchmarks._style import COLOURS, figure
-from benchmarks._timing import in_turns
-from benchmarks.studies._listed import listed
+from benchmarks._summary import quarters
+from benchmarks._timing import compiled
+from benchmarks.studies._listed import dots, listed
 from benchmarks.tasks.boxes import BOX10_START, box10_loss
 
 HELP = "derivatives against evaluating at the same points"
@@ -55,16 +55,15 @@ def transforms() -> dict[str, Callable]:
 def measure(options: Namespace, folder: Path) -> dict[str, Any]:
     """Ratios and times of each transform."""
     y, keys = jnp.asarray(BOX10_START), list(jax.random.split(jax.random.key(0), TURNS + 1))
-    alone = jax.jit(evaluating(box10_loss, SIGMA, SAMPLER, SAMPLES))
+    alone = evaluating(box10_loss, SIGMA, SAMPLER, SAMPLES)
     lines = []
     for name, transform in transforms().items():
-        derive = jax.jit(transform)
-        calls = {"ours": lambda i, f=derive: f(keys[i], y), "alone": lambda i: alone(keys[i], y)}
-        ours, evaluations = in_turns(calls, TURNS).values()
+        calls = {"ours": transform, "alone": alone}
+        ours, evaluations = compiled(calls, lambda i: (keys[i], y), TURNS).values()
         lines.append(
             {
                 "transform": name,
-                "ratio": np.quantile(ours / evaluations, [0.25, 0.5, 0.75]).tolist(),
+                "ratio": quarters(ours / evaluations),
                 "ms": 1e3 * np.median(ours).item(),
                 "ms of evaluating": 1e3 * np.median(evaluations).item(),
             }
@@ -83,16 +82,6 @@ def tables(results: dict[str, Any]) -> Iterator[Grid]:
 
 def draw(results: dict[str, Any], folder: Path) -> None:
     """Ratios with their quartiles."""
-    target, lines = results["target"], results["lines"]
-    low, middle, high = np.array([line["ratio"] for line in lines]).T
-    places = np.arange(len(lines))
-    with figure(folder / "overhead.png", 1, 1, (5, 3.2)) as (_, axes):
-        axis = axes[0, 0]
-        spread = (middle - low, high - middle)
-        axis.errorbar(middle, places, xerr=spread, fmt="o", color=COLOURS[1], capsize=3)
-        axis.axvline(1, color="0.4", lw=0.8)
-        axis.axvline(target, color=COLOURS[0], lw=0.8, ls="--")
-        axis.text(target, len(lines) - 0.6, f" target {target:.2f}", color=COLOURS[0], fontsize=8)
-        axis.set(yticks=places, yticklabels=[line["transform"] for line in lines])
-        axis.set(xlim=(min(0.9, low.min() - 0.05), max(1.25, high.max() + 0.05)))
-        axis.set(ylim=(len(lines) - 0.4, -0.6), xlabel="Time over evaluating alone")
+    rows = {line["transform"]: line["ratio"] for line in results["lines"]}
+    path, label = folder / "overhead.png", "Time over evaluating alone; the target is a line"
+    dots(path, rows, results["target"], label, (0.8, 2))

@@ -18,7 +18,7 @@ from benchmarks._study import COMMITTED
 from benchmarks._style import COLOURS, figure
 from benchmarks._task import NotAble, Task
 from benchmarks._timing import in_turns
-from benchmarks.scenes._dearer import SAVINGS
+from benchmarks.scenes.mitsuba_scene import SAVINGS
 from benchmarks.studies._listed import listed
 from benchmarks.studies.report._scene import load
 
@@ -58,21 +58,19 @@ def milliseconds(task: Task) -> dict[str, float]:
 def to_99(name: str, folders: Sequence[Path]) -> dict[str, float | None]:
     """Evaluations of ours to 99 % of the image error, and seconds of the fastest by their order.
 
-    Args:
-        name: Of the scene.
-        folders: The first that has results of it is read.
+    The first of the folders that has results of the scene is read.
     """
     scene = next(filter(None, (load(name, folder) for folder in folders)), None)
+    if scene is None:
+        return dict.fromkeys(("evaluations", "first order", "second order"))
 
     def fastest(methods: Sequence[str | None], cost: str) -> float | None:
-        if scene is None:
-            return None
         ran = (name for name in methods if name in scene.ran)
         took = (scene.reached(name, "image_error", "99", cost).median for name in ran)
         return min((each for each in took if each is not None), default=None)
 
     return {
-        "evaluations": fastest([scene.ours if scene else None], "evaluations"),
+        "evaluations": fastest([scene.ours], "evaluations"),
         "first order": fastest(FIRST, "seconds"),
         "second order": fastest(SECOND, "seconds"),
     }

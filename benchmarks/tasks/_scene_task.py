@@ -13,9 +13,15 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from benchmarks._task import Budget, NativeAD, Problem, Score, Task, TaskEntry
-from benchmarks.scenes._dearer import dearer
-from benchmarks.scenes.mitsuba_scene import VARIANT, Describe, Description, Params, picture
+from benchmarks._task import Budget, NativeAD, Problem, Score, Task, entry
+from benchmarks.scenes.mitsuba_scene import (
+    VARIANT,
+    Describe,
+    Description,
+    Params,
+    dearer,
+    picture,
+)
 
 EXACT, PHOTO = 9, 64  # times the samples, for the score and for the photograph
 
@@ -23,8 +29,6 @@ EXACT, PHOTO = 9, 64  # times the samples, for the score and for the photograph
 def scene_task(
     full: bool,
     *,
-    name: str,
-    title: str,
     scene: Describe,
     params: Params,
     reference: ArrayLike,
@@ -32,26 +36,23 @@ def scene_task(
     start_box: tuple[ArrayLike, ArrayLike],
     sigma: float,
     budget: Budget,
+    seeds: tuple[int, int] = (5, 20),
     resolution: int = 32,
     spp: int = 4,
     variant: str = VARIANT,
+    support: Any = None,
     ad_integrator: Description | None = None,
     photo: Float[np.ndarray, "height width 3"] | None = None,
     score: Score | None = None,
+    **named: Any,
 ) -> Task:
-    """The task. Its loss is the mean squared difference of the pictures.
+    """The task. Its loss is the mean squared difference of the pictures; others as in `Task`.
 
     Args:
-        full: 20 starts, not 5.
-        name: The task's name.
-        title: What is sought, in one line.
         scene: Describes the scene.
         params: What is varied.
-        reference: The y that is sought.
-        bounds: (low, high), each like y.
         start_box: (low, high): starts are uniform in between.
-        sigma: The scale of all entries of y.
-        budget: Where a run ends.
+        seeds: Quick and full.
         resolution: Pixels along a side.
         spp: Samples per pixel, a square.
         variant: Of Mitsuba.
@@ -78,35 +79,29 @@ def scene_task(
 
         score = Score(sought, exact_loss, image)
 
-    def start(seed: int) -> Float[Array, " n"]:
-        return jax.random.uniform(
-            jax.random.key(seed), sought.shape, minval=start_low, maxval=start_high
-        )
+    def native_ad() -> NativeAD:
+        from benchmarks.scenes._mitsuba_ad import value_and_grad
 
-    def native_ad(integrator: Description) -> NativeAD:
-        from benchmarks.scenes import _mitsuba_ad
+        assert ad_integrator is not None
+        return value_and_grad(scene, params, ad_integrator, photo, spp)
 
-        return _mitsuba_ad.value_and_grad(scene, params, integrator, photo, spp)
-
+    uniform = partial(jax.random.uniform, shape=sought.shape, minval=start_low, maxval=start_high)
     return Task(
-        name=name,
-        title=title,
         problem=Problem(
             bounds=(low, high),
             sigma=sigma,
             budget=budget,
             residuals=lambda y: render(y) - photo,
-            native_ad=partial(native_ad, ad_integrator) if ad_integrator else None,
+            support=support,
+            native_ad=native_ad if ad_integrator else None,
         ),
         score=score,
-        start=start,
-        seeds=20 if full else 5,
+        start=lambda seed: uniform(jax.random.key(seed)),
+        seeds=seeds[full],
         dearer=lambda: dearer(scene, params, resolution, spp, variant),
         notes=f"{resolution} x {resolution} pixels, {spp} samples per pixel, {variant}",
+        **named,
     )
 
 
-def scene_entry(name: str, title: str, **settings: Any) -> dict[str, TaskEntry]:
-    """A module's TASKS with one such task; settings as for `scene_task`."""
-    build = partial(scene_task, name=name, title=title, **settings)
-    return {name: TaskEntry(title, "scene", build)}
+scene_entry = partial(entry, "scene", scene_task)

@@ -5,23 +5,21 @@ middle of a plateau. Where squares hide each other, a hidden one has no gradient
 at the start stays lost to whoever looks around it, even at the scale sigma.
 """
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from benchmarks._task import Budget, Task, TaskEntry
-from benchmarks.tasks._drawn import drawn, uniform
+from benchmarks._task import Effort
+from benchmarks.tasks._drawn import function, uniform
 
 PIXELS = 64
 SIDE = 13  # of a square, in pixels
 COLOURS = ((0.9, 0.1, 0.1), (0.1, 0.8, 0.1), (0.1, 0.2, 0.9), (0.8, 0.7, 0.1), (0.6, 0.1, 0.7))
 BOX10_START = (0.46, 0.46, 0.54, 0.46, 0.5, 0.5, 0.46, 0.54, 0.54, 0.54)  # huddled
 BOX10_REFERENCE = (0.2, 0.2, 0.8, 0.2, 0.5, 0.5, 0.2, 0.8, 0.8, 0.8)  # apart
-SIGMA = 0.15
-BOUNDS = (0.1, 0.9)  # within, a square is in the image
 
 
 def on_plateau(y: Sequence[float]) -> np.ndarray:
@@ -59,53 +57,40 @@ def box10_loss(y: Float[Array, "10"]) -> Float[Array, ""]:
     return jnp.mean((draw(y) - reference) ** 2)
 
 
-def one(full: bool) -> Task:
-    """Starts are anywhere in the image."""
-    budget = Budget(5000, 60) if full else Budget(1000, 10)
-    start = uniform(2, 0.15, 0.85)
-    return _task("box2", draw, (0.5, 0.5), start, budget, 20 if full else 3)
-
-
-def five(name: str, draw: Callable[[Array], Array], full: bool) -> Task:
-    """Starts are huddled, so that each square hinders the others, and are sought apart."""
-    budget = Budget(15_000, 120) if full else Budget(5000, 30)
-    start = uniform(10, -0.02, 0.02, around=BOX10_START)
-    return _task(name, draw, BOX10_REFERENCE, start, budget, 20 if full else 2)
-
-
-def _task(
-    name: str,
-    draw: Callable[[Array], Array],
-    reference: Sequence[float],
-    start: Callable[[int], Array],
-    budget: Budget,
-    seeds: int,
-) -> Task:
-    return drawn(
-        name,
-        TASKS[name].title,
-        draw,
-        on_plateau(reference),
-        sigma=SIGMA,
-        budget=budget,
-        seeds=seeds,
-        start=start,
-        bounds=BOUNDS,
-        image=draw,
-        notes=f"{PIXELS} x {PIXELS} pixels",
-    )
-
-
-TASKS = {
-    "box2": TaskEntry("Box2: position of a square", "function", one),
-    "box10": TaskEntry(
-        "Box10: positions of five squares whose colours add up",
-        "function",
-        partial(five, "box10", draw),
-    ),
-    "box10-occluding": TaskEntry(
-        "Box10, occluding: positions of five squares that hide each other",
-        "function",
-        partial(five, "box10-occluding", draw_occluding),
-    ),
+SHARED: dict[str, Any] = {
+    "sigma": 0.15,
+    "bounds": (0.1, 0.9),  # within, a square is in the image
+    "notes": f"{PIXELS} x {PIXELS} pixels",
 }
+# starts are huddled, so that each square hinders the others, and are sought apart
+FIVE: dict[str, Any] = SHARED | {
+    "reference": on_plateau(BOX10_REFERENCE),
+    "start": uniform(10, -0.02, 0.02, around=BOX10_START),
+    "effort": (Effort(5000, 30, seeds=2), Effort(15_000, 120, seeds=20)),
+}
+TASKS = (
+    function(
+        "box2",
+        "Box2: position of a square",
+        draw=draw,
+        image=draw,
+        reference=on_plateau((0.5, 0.5)),
+        start=uniform(2, 0.15, 0.85),  # anywhere in the image
+        effort=(Effort(1000, 10, seeds=3), Effort(5000, 60, seeds=20)),
+        **SHARED,
+    )
+    | function(
+        "box10",
+        "Box10: positions of five squares whose colours add up",
+        draw=draw,
+        image=draw,
+        **FIVE,
+    )
+    | function(
+        "box10-occluding",
+        "Box10, occluding: positions of five squares that hide each other",
+        draw=draw_occluding,
+        image=draw_occluding,
+        **FIVE,
+    )
+)

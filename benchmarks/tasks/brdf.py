@@ -4,11 +4,13 @@ Appendix G of the paper on higher-order rendering. Everything is smooth in the p
 there is a Hessian to compare with.
 """
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from benchmarks._task import Budget, Task, TaskEntry
+from benchmarks._task import Effort, Task, entry
 from benchmarks.tasks._drawn import drawn, uniform
 
 LIGHT = np.array([1.5, 1.5, 3.0])  # of a sphere of radius 1 at the origin; the eye is far along z
@@ -41,22 +43,21 @@ def _geometry(pixels: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.maximum(facing, 0), np.maximum(mirrored, 1e-6), lit
 
 
-def build(full: bool) -> Task:
+def build(full: bool, **named: Any) -> Task:
     """Quick: 32 x 32 pixels; full: 64 x 64. Parameters are between 0 and 1."""
     pixels = 64 if full else 32
     draw = lambda y: shade(y, pixels)
     return drawn(
-        "brdf",
-        TASKS["brdf"].title,
-        draw,
-        REFERENCE,
+        full,
+        draw=draw,
+        reference=REFERENCE,
         sigma=0.15,
-        budget=Budget(5000, 60) if full else Budget(2000, 15),
-        seeds=20 if full else 3,
+        effort=(Effort(2000, 15, seeds=3), Effort(5000, 60, seeds=20)),
         start=uniform(7, SPARED, 1 - SPARED),
         image=draw,
         notes=f"{pixels} x {pixels} pixels",
+        **named,
     )
 
 
-TASKS = {"brdf": TaskEntry("BRDF: Phong's model of a sphere under a point light", "scene", build)}
+TASKS = entry("scene", build, "brdf", "BRDF: Phong's model of a sphere under a point light")

@@ -11,6 +11,7 @@ What is sought is a known slab that draws a face; the paper's is any slab that d
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,10 +20,10 @@ from jaxtyping import Array, Float
 from scipy import interpolate
 
 import smoothdiff as sd
-from benchmarks._task import Budget, Problem, Score, Task, TaskEntry
+from benchmarks._task import Effort, Problem, Score, Task, entry
 
-TITLE = "Caustic: 1,024 coefficients of a refracting height field"
 SIDE = 32  # coefficients
+MIDDLES = (np.arange(SIDE) - 1) / (SIDE - 3)  # of the splines; those at the edge are outside
 INDEX = 1.33  # of refraction
 DISTANCE = 1.0  # of the receiver, in widths of the slab
 HEIGHT = 0.01  # of a coefficient of 1, likewise
@@ -31,9 +32,10 @@ REACH = 2.0  # tiles around where the light of a coefficient's place falls
 WIDTH = 0.045  # of the ridges of what is sought, which bring parallel light to a line
 
 
-def build(full: bool) -> Task:
+def build(full: bool, **named: Any) -> Task:
     """Starts are almost flat. Quick: 128² rays, 32² pixels; full: 256² and 64²."""
     rays, pixels = (256, 64) if full else (128, 32)
+    much = Effort(100_000, 600, seeds=10) if full else Effort(20_000, 120, seeds=2)
     reference = jnp.asarray(face(), jnp.float32)
     target = jax.jit(lambda y: draw(y, rays, pixels))(reference)
 
@@ -43,38 +45,29 @@ def build(full: bool) -> Task:
         tiles = (draw(y, rays, pixels) - target).reshape(SIDE, side, SIDE, side)
         return jnp.swapaxes(tiles, 1, 2).reshape(SIDE, SIDE, -1)
 
-    def terms(y: Float[Array, "32 32"]) -> Float[Array, "32 32"]:
-        return jnp.sum(residuals(y) ** 2, axis=-1) / target.size
-
-    def start(seed: int) -> Float[Array, "32 32"]:
-        return 0.05 * jax.random.normal(jax.random.key(seed), (SIDE, SIDE))
-
     def image(y: Float[Array, "32 32"]) -> Float[Array, "height width 3"]:
         return jnp.repeat(draw(y, rays, pixels)[..., None] / 4, 3, axis=-1)
 
     return Task(
-        name="caustic",
-        title=TITLE,
         problem=Problem(
             bounds=(jnp.full_like(reference, -BOUND), jnp.full_like(reference, BOUND)),
             sigma=SIGMA,
-            budget=Budget(100_000, 600) if full else Budget(20_000, 120),
+            budget=much.budget,
             residuals=residuals,
-            terms=terms,
             support=sd.moving_support(around),
         ),
         score=Score(reference, image=image),
-        start=start,
-        seeds=10 if full else 2,
+        start=lambda seed: 0.05 * jax.random.normal(jax.random.key(seed), (SIDE, SIDE)),
+        seeds=much.seeds,
         notes=f"{rays} x {rays} rays, {pixels} x {pixels} pixels. A wave that is even over the "
         "slab does not move light: the parameter error says little.",
+        **named,
     )
 
 
 def around(y: Float[Array, "32 32"]) -> Callable[[Float[Array, "32 32"]], Array]:
     """The tiles, one for each coefficient, near to where the light of its place falls."""
-    places = np.clip((np.arange(SIDE) - 1) / (SIDE - 3), 0, 1)  # the outermost are outside
-    falls = SIDE * land(y, places).reshape(2, 1, -1)
+    falls = SIDE * land(y, np.clip(MIDDLES, 0, 1)).reshape(2, 1, -1)
     tiles = jnp.arange(SIDE, dtype=y.dtype)[None, :, None] + 0.5
     column, row = (jnp.abs(falls - tiles) < REACH).astype(y.dtype)
     near = row[:, None] * column[None]
@@ -120,8 +113,7 @@ def land(
 
 def face() -> Float[np.ndarray, "32 32"]:
     """Coefficients of a round face: ridges as high as brings light to lines on the receiver."""
-    middles = (np.arange(SIDE) - 1) / (SIDE - 3)  # of the splines; those at the edge are outside
-    x, y = np.meshgrid(middles - 0.5, middles - 0.5)
+    x, y = np.meshgrid(MIDDLES - 0.5, MIDDLES - 0.5)
     radius = np.hypot(x, y)
     lines = [
         radius - 0.36,
@@ -141,4 +133,4 @@ def _basis(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return spline(places), spline.derivative()(places)
 
 
-TASKS = {"caustic": TaskEntry(TITLE, "large", build)}
+TASKS = entry("large", build, "caustic", "Caustic: 1,024 coefficients of a refracting height field")

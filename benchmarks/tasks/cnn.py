@@ -12,6 +12,7 @@ noise of all pictures is the same, so the right pose has no loss.
 """
 
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -20,13 +21,10 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from benchmarks._task import Budget, Grey, Problem, Score, Task, TaskEntry
+from benchmarks._task import Effort, Grey, Problem, Score, Task, entry
 from benchmarks.scenes.mitsuba_scene import Params, picture
 from benchmarks.scenes.networks import last_layer
 from benchmarks.tasks import mug
-
-CNN = "CNN: 267,745 weights of a network that sees a mug's rotation"
-CNN5 = "CNN5: 268,773 weights of a network that sees a mug's pose and colour"
 
 POSE_SIGMA = 0.5  # the scale of a pose
 SIGMA, BOUND = 0.025, 50.0  # of the weights, for methods that know of nothing else
@@ -71,9 +69,7 @@ class Network(eqx.Module):
         return self.layers[1](self.hidden(seen))
 
 
-def network_task(
-    full: bool, *, name: str, title: str, params: Params, spread: tuple[float, ...]
-) -> Task:
+def network_task(full: bool, params: Params, spread: tuple[float, ...], **named: Any) -> Task:
     """The task of training the network. Its weights are y.
 
     Quick: 32 x 32 pixels, 256 pictures to train on; full: 64 x 64 and 1,024. With fewer, also a
@@ -81,12 +77,12 @@ def network_task(
 
     Args:
         full: As for all tasks.
-        name: Of the task.
-        title: What is sought.
         params: The parameters of the scene, of a pose, which begins with an angle.
         spread: Entries of poses are uniform between minus and plus this.
+        named: The task's name and title.
     """
     size, cases, held_out = (64, 1024, 64) if full else (32, 256, 32)
+    much = Effort(400_000, 3600, seeds=5) if full else Effort(16_000, 240, seeds=1)
     render, cleaner = (
         picture(mug.scene, params, resolution=size, spp=spp) for spp in (SPP, SCORE_SPP)
     )
@@ -130,20 +126,19 @@ def network_task(
 
     reference = flat(solved(initial(2**31), jax.vmap(seen)(pictures), poses, held_out))
     return Task(
-        name=name,
-        title=title,
         problem=Problem(
             bounds=(jnp.full_like(reference, -BOUND), jnp.full_like(reference, BOUND)),
             sigma=SIGMA,
-            budget=Budget(400_000, 3600) if full else Budget(16_000, 240),
+            budget=much.budget,
             grey=Grey(white, render, pictures[:cases], POSE_SIGMA),
         ),
         score=Score(reference, exact_loss, image, distance),
         start=lambda seed: flat(initial(seed)),
-        seeds=5 if full else 1,
+        seeds=much.seeds,
         notes=f"{cases} pictures of {size} x {size} pixels, {SPP} samples per pixel. An evaluation "
         f"is a render. Errors are those on {held_out} other pictures, by renders with {SCORE_SPP} "
         "samples per pixel; parameters are poses.",
+        **named,
     )
 
 
@@ -179,6 +174,18 @@ POSE: Params = {
     "lamp.intensity.value": lambda pose: jnp.maximum(BRIGHT + TINT * pose[2:5], 0),
 }
 
-cnn = partial(network_task, name="cnn", title=CNN, params=ROTATION, spread=(2.2,))
-cnn5 = partial(network_task, name="cnn5", title=CNN5, params=POSE, spread=(1.5,) * 5)
-TASKS = {"cnn": TaskEntry(CNN, "network", cnn), "cnn5": TaskEntry(CNN5, "network", cnn5)}
+TASKS = entry(
+    "network",
+    network_task,
+    "cnn",
+    "CNN: 267,745 weights of a network that sees a mug's rotation",
+    params=ROTATION,
+    spread=(2.2,),
+) | entry(
+    "network",
+    network_task,
+    "cnn5",
+    "CNN5: 268,773 weights of a network that sees a mug's pose and colour",
+    params=POSE,
+    spread=(1.5,) * 5,
+)

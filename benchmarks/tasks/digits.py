@@ -15,15 +15,16 @@ Sigma is that of ZeroGrads (supplement, Table 1).
 """
 
 from collections.abc import Callable
-from functools import cache
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
+from scipy import interpolate, ndimage
 
-from benchmarks._task import Budget, NotAble, Task, TaskEntry
+from benchmarks._task import Effort, NotAble, Task, entry
 from benchmarks.scenes import networks
 from benchmarks.tasks._drawn import drawn
 
@@ -39,6 +40,8 @@ INPUT = np.random.default_rng(0).uniform(-1, 1, LAYERS[0])
 DECODER = (20, 34, 146, 20)
 POINTS, SAMPLES = 10, 120  # of a spline: what it goes through, and what is drawn
 PEN = 2  # its width, in pixels
+TIMES = np.linspace(0, POINTS - 1, SAMPLES)
+SPLINE = interpolate.CubicSpline(np.arange(POINTS), np.eye(POINTS))(TIMES)  # from its points
 DIAGONAL = np.stack([np.linspace(0.2, 0.8, POINTS)] * 2, axis=1)
 # the points of the digits from 0 to 9, x to the right and y downwards, in percent of the picture
 STROKES = """
@@ -67,25 +70,18 @@ def written() -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(values).reshape(-1, 8, 8) / 16, first
 
 
-def enlarged(digit: Float[np.ndarray, "8 8"]) -> Float[np.ndarray, "28 28"]:
-    """By linear interpolation."""
-    from scipy import ndimage
-
-    at = (np.arange(PIXELS) + 0.5) * len(digit) / PIXELS - 0.5
-    points = np.meshgrid(at, at, indexing="ij")
-    return ndimage.map_coordinates(digit, points, order=1, mode="nearest")
-
-
 def draw(layers: networks.Layers) -> Float[Array, "784"]:
     """What a network draws."""
     return jax.nn.sigmoid(networks.apply(layers, jnp.asarray(INPUT, layers[0][0].dtype)))
 
 
 def solved() -> networks.Layers:
-    """A network that draws the digit: all is in the last bias."""
+    """A network that draws the digit, enlarged to 28 x 28 pixels: all is in the last bias."""
     images, first = written()
-    digit = enlarged(images[first[DIGIT]]).ravel()
-    target = 0.5 + CONTRAST * (digit - 0.5)
+    small = images[first[DIGIT]]
+    zoom = PIXELS / len(small)
+    digit: Any = ndimage.zoom(small, zoom, order=1, mode="nearest", grid_mode=True)
+    target = 0.5 + CONTRAST * (digit.ravel() - 0.5)
     layers = jax.tree.map(jnp.zeros_like, networks.initial(LAYERS, jax.random.key(0)))
     layers[-1] = layers[-1][0], jnp.asarray(np.log(target / (1 - target)), jnp.float32)
     return layers
@@ -101,18 +97,9 @@ def codes() -> Float[np.ndarray, "10 20"]:
     return (centred @ directions[:size].T * (len(flat) ** 0.5 / spreads[:size]))[first]
 
 
-@cache
-def _spline() -> Float[np.ndarray, "120 10"]:
-    """From points to the curve through them."""
-    from scipy import interpolate
-
-    times = np.linspace(0, POINTS - 1, SAMPLES)
-    return interpolate.CubicSpline(np.arange(POINTS), np.eye(POINTS))(times)
-
-
 def rasterise(points: Float[Array, "10 2"]) -> Float[Array, "28 28"]:
     """The spline through the points: 1 where a square pen has been."""
-    curve = jnp.asarray(_spline(), points.dtype) @ points * PIXELS
+    curve = jnp.asarray(SPLINE, points.dtype) @ points * PIXELS
     middles = jnp.asarray(np.arange(PIXELS) + 0.5, points.dtype)
     near = (jnp.abs(curve[..., None] - middles[None, None]) <= PEN / 2).astype(points.dtype)
     # a square is a product of two lines of pixels
@@ -134,47 +121,43 @@ def solved_decoder(codes: Float[Array, "10 20"]) -> networks.Layers:
 
 
 def _task(
-    name: str,
+    full: bool,
     draw: Callable[[networks.Layers], Float[Array, "..."]],
     solved: networks.Layers,
     look: Callable[[Array], Float[Array, "height width"]],
     many: str,
-    full: bool,
+    **named: Any,
 ) -> Task:
     """Starts are networks as they are before training; `look` arranges what is drawn."""
     reference, layers = ravel_pytree(solved)
     sizes = [solved[0][0].shape[1], *(bias.size for _, bias in solved)]
     return drawn(
-        name,
-        TASKS[name].title,
-        lambda y: draw(layers(y)),
-        reference,
+        full,
+        draw=lambda y: draw(layers(y)),
+        reference=reference,
         sigma=SIGMA,
-        budget=Budget(100_000, 1200) if full else Budget(4000, 120),
-        seeds=10 if full else 1,
+        effort=(Effort(4000, 120, seeds=1), Effort(100_000, 1200, seeds=10)),
         start=lambda seed: ravel_pytree(networks.initial(sizes, jax.random.key(seed)))[0],
         bounds=(-BOUND, BOUND),
         image=lambda y: jnp.repeat(look(draw(layers(y)))[..., None], 3, axis=-1),
         notes=f"Many {many}: the parameter error says nothing.",
+        **named,
     )
 
 
-def mlp(full: bool) -> Task:
+def mlp(full: bool, **named: Any) -> Task:
     look = lambda grey: grey.reshape(PIXELS, PIXELS)
-    return _task("mlp", draw, solved(), look, "networks draw the digit", full)
+    return _task(full, draw, solved(), look, "networks draw the digit", **named)
 
 
-def spline_vae(full: bool) -> Task:
+def spline_vae(full: bool, **named: Any) -> Task:
     code = jnp.asarray(codes(), jnp.float32)
     draw = jax.jit(lambda layers: jax.vmap(lambda code: decode(layers, code))(code))
     look = lambda ten: jnp.block([list(row) for row in ten.reshape(2, 5, PIXELS, PIXELS)])
-    many = "decoders draw the digits"
-    return _task("spline-vae", draw, solved_decoder(code), look, many, full)
+    return _task(full, draw, solved_decoder(code), look, "decoders draw the digits", **named)
 
 
-TASKS = {
-    "mlp": TaskEntry("MLP: 35,152 weights of a network that draws a digit", "program", mlp),
-    "spline-vae": TaskEntry(
-        "Spline VAE: 8,764 weights of a decoder that draws digits", "program", spline_vae
-    ),
-}
+TASKS = entry("program", mlp, "mlp", "MLP: 35,152 weights of a network that draws a digit")
+TASKS |= entry(
+    "program", spline_vae, "spline-vae", "Spline VAE: 8,764 weights of a decoder that draws digits"
+)

@@ -8,6 +8,7 @@ another optimum and another rotation, and the loss is how far it is above its lo
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import smoothdiff as sd
-from benchmarks._task import Budget, Loss, Problem, Score, Task, TaskEntry
+from benchmarks._task import Budget, Effort, Loss, Problem, Score, Task, entry
 from benchmarks.tasks._drawn import uniform
 
 QUAD_REFERENCE = (0.4, -0.7)
@@ -47,15 +48,14 @@ def _function(
 ) -> Task:
     """A function in n dimensions whose lowest value is 0; `quick` evaluations for each of them."""
     n = reference.size
-    budget = Budget(2000 * n, 60) if full else Budget(quick * n, 10)
-    bounds = np.full(n, -5.0), np.full(n, 5.0)
+    much = Effort(2000 * n, 60, seeds=20) if full else Effort(quick * n, 10, seeds=2)
     return Task(
         f"{name}-{n}d",
         f"{title} in {n}-D",
-        Problem(bounds, sigma, budget, loss, residuals),
+        Problem((np.full(n, -5.0), np.full(n, 5.0)), sigma, much.budget, loss, residuals),
         Score(reference, optimum=0.0),
         start or uniform(n, -4, 4),
-        20 if full else 2,
+        much.seeds,
         "float64",
         choose,
     )
@@ -71,13 +71,12 @@ def bowl(y: Float[Array, "2"]) -> Float[Array, ""]:
     return 5 * d[0] ** 2 + 5 * d[1] ** 2 + 7.5 * d[0] * d[1]
 
 
-def quad(full: bool) -> Task:
+def quad(full: bool, **named: Any) -> Task:
     """Starts are within 3 of the reference."""
-    reference = jnp.asarray(QUAD_REFERENCE)
-    budget = Budget(2000, 30) if full else Budget(600, 10)
-    problem = Problem((reference - 10, reference + 10), 1.0, budget, bowl)
-    start = uniform(2, -3, 3, around=QUAD_REFERENCE)
-    return Task("quad", TASKS["quad"].title, problem, Score(reference), start, 20 if full else 5)
+    reference, start = jnp.asarray(QUAD_REFERENCE), uniform(2, -3, 3, around=QUAD_REFERENCE)
+    much = Effort(2000, 30, seeds=20) if full else Effort(600, 10, seeds=5)
+    problem = Problem((reference - 10, reference + 10), 1.0, much.budget, bowl)
+    return Task(problem=problem, score=Score(reference), start=start, seeds=much.seeds, **named)
 
 
 def valley(y: Float[Array, "n"]) -> Float[Array, "m"]:
@@ -85,15 +84,13 @@ def valley(y: Float[Array, "n"]) -> Float[Array, "m"]:
     return jnp.concatenate([10 * (y[1:] - y[:-1] ** 2), 1 - y[:-1]])
 
 
-def rosenbrock(full: bool) -> list[Task]:
+def rosenbrock(full: bool, **named: Any) -> list[Task]:
     """A curved valley to where all are 1; all seeds have the classical start, (-1.2, 1, ...)."""
 
     def in_dimensions(n: int) -> Task:
-        title, loss = TASKS["rosenbrock"].title, _squares(valley)
         start = lambda seed: jnp.asarray(np.resize([-1.2, 1.0], n))
-        return _function(
-            full, "rosenbrock", title, np.ones(n), loss, valley, start=start, sigma=0.3
-        )
+        given = {"reference": np.ones(n), "loss": _squares(valley), "residuals": valley}
+        return _function(full, **named, **given, start=start, sigma=0.3)
 
     return [in_dimensions(n) for n in ((2, 10, 30) if full else (2, 10))]
 
@@ -103,24 +100,26 @@ def well(y: Float[Array, "2"]) -> Float[Array, ""]:
     return -jnp.exp(-jnp.sum(y**2) / 2)
 
 
-def negated_gaussian(full: bool) -> Task:
+def negated_gaussian(full: bool, **named: Any) -> Task:
     """The minimum is to be found from a grid over (-3, 3)², quick 2 x 2, full 6 x 6.
 
     Appendix H of the paper on higher-order rendering. Its widths and normalisation are not stated
     there; here function and smoothing have width 1, and the lowest value is -1.
     """
-    cells = 6 if full else 2  # even, which leaves out the minimum
-    line = (np.arange(cells) + 0.5) / cells * 6 - 3
+    cells, budget = (6, Budget(2000, 30)) if full else (2, Budget(500, 10))
+    line = (np.arange(cells) + 0.5) / cells * 6 - 3  # an even number leaves out the minimum
     grid = np.stack(np.meshgrid(line, line), -1).reshape(-1, 2)
-    budget = Budget(2000, 30) if full else Budget(500, 10)
-    problem = Problem((np.full(2, -5.0), np.full(2, 5.0)), 1.0, budget, well)
-    score = Score(np.zeros(2), optimum=-1.0)
-    start = lambda seed: jnp.asarray(grid[seed % len(grid)])
-    title = TASKS["negated-gaussian"].title
-    return Task("negated-gaussian", title, problem, score, start, len(grid), "float64")
+    return Task(
+        problem=Problem((np.full(2, -5.0), np.full(2, 5.0)), 1.0, budget, well),
+        score=Score(np.zeros(2), optimum=-1.0),
+        start=lambda seed: jnp.asarray(grid[seed % len(grid)]),
+        seeds=len(grid),
+        precision="float64",
+        **named,
+    )
 
 
-def ellipsoid(full: bool) -> list[Task]:
+def ellipsoid(full: bool, **named: Any) -> list[Task]:
     """Rotated, and 10⁶ times as curved along one axis as along another; all drawn once.
 
     It is f10 of BBOB without the oscillation: what a second-order method is made for.
@@ -135,8 +134,8 @@ def ellipsoid(full: bool) -> list[Task]:
         def residuals(y: Float[Array, "n"]) -> Float[Array, "n"]:
             return jnp.asarray(stretched) * (jnp.asarray(axes) @ (y - reference))
 
-        title, loss = TASKS["ellipsoid"].title, _squares(residuals)
-        return _function(full, "ellipsoid", title, reference, loss, residuals, quick=500)
+        given = {"reference": reference, "loss": _squares(residuals), "residuals": residuals}
+        return _function(full, **named, **given, quick=500)
 
     return [in_dimensions(n) for n in ((5, 10) if full else (5,))]
 
@@ -160,7 +159,7 @@ class OnHost:
         return np.array([self._problem(point) - lowest for point in points])
 
 
-def bbob(full: bool) -> list[Task]:
+def bbob(full: bool, **named: Any) -> list[Task]:
     """Quick: three functions in 5-D; full: all in 2, 5, 10 and 20-D."""
 
     def in_dimensions(number: int, n: int) -> Task:
@@ -173,12 +172,15 @@ def bbob(full: bool) -> list[Task]:
     return [in_dimensions(number, n) for number in numbers for n in dimensions]
 
 
-TASKS = {
-    "quad": TaskEntry("Quad: a quadratic in 2-D", "function", quad),
-    "rosenbrock": TaskEntry("Rosenbrock's valley", "function", rosenbrock),
-    "negated-gaussian": TaskEntry(
-        "Negated Gaussian: a minimum among indefinite Hessians", "function", negated_gaussian
-    ),
-    "ellipsoid": TaskEntry("Ellipsoid of condition number 1e6", "function", ellipsoid),
-    "bbob": TaskEntry("BBOB: eight noiseless functions", "function", bbob),
-}
+TASKS = (
+    entry("function", quad, "quad", "Quad: a quadratic in 2-D")
+    | entry("function", rosenbrock, "rosenbrock", "Rosenbrock's valley")
+    | entry(
+        "function",
+        negated_gaussian,
+        "negated-gaussian",
+        "Negated Gaussian: a minimum among indefinite Hessians",
+    )
+    | entry("function", ellipsoid, "ellipsoid", "Ellipsoid of condition number 1e6")
+    | entry("function", bbob, "bbob", "BBOB: eight noiseless functions")
+)

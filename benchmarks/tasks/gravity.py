@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from benchmarks._task import Budget, Task, TaskEntry
+from benchmarks._task import Effort, Task, entry
 from benchmarks.tasks._drawn import drawn
 
 STEPS, SECONDS_PER_STEP, SEEN_EVERY = 900, 1 / 500, 225
@@ -111,21 +111,21 @@ def _cross(arm: Array, force: Array) -> Array:
     return arm[..., 0] * force[..., 1] - arm[..., 1] * force[..., 0]
 
 
-def build(full: bool) -> list[Task]:
+def build(full: bool, name: str, title: str) -> list[Task]:
     """Soft and stiff contacts."""
     return [
         drawn(
-            f"{kind}-5d",
-            f"{TASKS['gravity'].title}, {kind} contacts",
-            partial(fall, rate=rate),
-            REFERENCE,
+            full,
+            name=f"{kind}-5d",
+            title=f"{title}, {kind} contacts",
+            draw=partial(fall, rate=rate),
+            reference=REFERENCE,
             sigma=0.2,
-            budget=Budget(3000, 600) if full else Budget(600, 120),
-            seeds=10 if full else 2,
+            effort=(Effort(600, 120, seeds=2), Effort(3000, 600, seeds=10)),
             optimum=0.0,
         )
         for kind, rate in RATES.items()
     ]
 
 
-TASKS = {"gravity": TaskEntry("Gravity: three cubes that are dropped", "program", build)}
+TASKS = entry("program", build, "gravity", "Gravity: three cubes that are dropped")

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 import smoothdiff as sd
-from benchmarks._task import Budget, Task, TaskEntry
-from benchmarks.tasks._drawn import drawn
+from benchmarks._task import Effort
+from benchmarks.tasks._drawn import program
 
 PANELS, DIGITS, SEGMENTS = (4, 3), 4, 7
 SIZE = PANELS[0] * PANELS[1] * DIGITS * SEGMENTS
@@ -25,14 +25,13 @@ DIGIT = np.array(
 )  # fmt: skip
 
 
-def _segments() -> np.ndarray:
-    """The segment of each pixel of the display, -1 where there is none."""
-    digits = np.arange(SIZE // SEGMENTS).reshape(PANELS[0], PANELS[1] * DIGITS)
-    rows = [[np.where(DIGIT < 0, -1, DIGIT + SEGMENTS * k) for k in row] for row in digits]
-    return np.block(rows)
-
-
-SEGMENT = _segments()
+# likewise of each pixel of the display
+SEGMENT = np.block(
+    [
+        [np.where(DIGIT < 0, -1, DIGIT + SEGMENTS * k) for k in row]
+        for row in np.arange(SIZE // SEGMENTS).reshape(PANELS[0], PANELS[1] * DIGITS)
+    ]
+)
 REFERENCE = np.where(np.random.default_rng(0).random(SIZE) < 0.5, 0.25, 0.75)
 
 
@@ -49,29 +48,20 @@ def draw(y: Float[Array, "336"]) -> Float[Array, "44 84"]:
 
 def support():
     """Which pixels a parameter may change: those of its segment."""
-    from scipy import sparse
-
-    pixels = np.flatnonzero(SEGMENT.ravel() >= 0)
-    entries = (np.ones(pixels.size), (pixels, SEGMENT.ravel()[pixels]))
-    return sd.matrix_support(sparse.coo_array(entries, (SEGMENT.size, SIZE)), SEGMENT.shape)
+    return sd.matrix_support(SEGMENT.reshape(-1, 1) == np.arange(SIZE), SEGMENT.shape)
 
 
-def build(full: bool) -> Task:
-    """Starts are anywhere in the domain, so half of the switches are wrong."""
-    return drawn(
-        "led",
-        TASKS["led"].title,
-        draw,
-        REFERENCE,
-        support=support(),
-        sigma=0.33,
-        budget=Budget(60_000, 600) if full else Budget(8000, 120),
-        seeds=10 if full else 3,
-        image=lambda y: jnp.stack([draw(y), 0.1 * draw(y), 0.1 * draw(y)], axis=-1),
-        meaning=switches,
-        optimum=0.0,
-        notes="Both errors are the wrong switches, relative to those of the start.",
-    )
-
-
-TASKS = {"led": TaskEntry("LED: 336 binary switches of a display", "program", build)}
+# starts are anywhere in the domain, so half of the switches are wrong
+TASKS = program(
+    "led",
+    "LED: 336 binary switches of a display",
+    draw=draw,
+    reference=REFERENCE,
+    support=support,
+    sigma=0.33,
+    effort=(Effort(8000, 120, seeds=3), Effort(60_000, 600, seeds=10)),
+    image=lambda y: jnp.stack([draw(y), 0.1 * draw(y), 0.1 * draw(y)], axis=-1),
+    meaning=switches,
+    optimum=0.0,
+    notes="Both errors are the wrong switches, relative to those of the start.",
+)

@@ -8,10 +8,11 @@ Sigma is that of ZeroGrads (supplement, Table 1), in units of the domain.
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy import sparse
 
 import smoothdiff as sd
-from benchmarks._task import Budget, Task, TaskEntry
-from benchmarks.tasks._drawn import drawn
+from benchmarks._task import Effort
+from benchmarks.tasks._drawn import program
 
 ROWS, COLUMNS = 16, 20
 SIZE = ROWS * COLUMNS
@@ -22,21 +23,17 @@ SHADES = (0.35, 1.0, 0.7)  # of the left side, the right side and the top
 FLOOR = 0.15
 
 
-def _rays() -> tuple[np.ndarray, np.ndarray]:
-    """Where rays meet the screen: from the left, (H, W), and upwards from the floor, (H,)."""
-    reach = np.sqrt(2) * HALF
-    height = (ROWS - 1 + 2 * reach) * UP + 2 * HALF * AWAY
-    columns, rows = (RAYS * int(size * PIXELS) for size in (COLUMNS, height))
-    # each anywhere in its cell: an upright edge would meet all rays of a straight line at once
-    x = np.arange(columns) + np.random.default_rng(0).random((rows, columns))
-    v = np.arange(rows)[::-1] + 0.5
-    return x / PIXELS / RAYS, v / PIXELS / RAYS - reach * UP
-
-
-X, V = _rays()
-BY_PIXEL = (X.shape[0] // RAYS, RAYS, X.shape[1] // RAYS, RAYS)
+REACH = np.sqrt(2) * HALF
+# where rays meet the screen: from the left, (H, W), and upwards from the floor, (H,)
+HEIGHT = (ROWS - 1 + 2 * REACH) * UP + 2 * HALF * AWAY
+BY_PIXEL = (int(HEIGHT * PIXELS), RAYS, COLUMNS * PIXELS, RAYS)
+LINES = np.arange(BY_PIXEL[0] * RAYS)
+# each anywhere in its cell: an upright edge would meet all rays of a straight line at once
+ASIDE = np.random.default_rng(0).random((LINES.size, BY_PIXEL[2] * RAYS))
+X = (np.arange(ASIDE.shape[1]) + ASIDE) / PIXELS / RAYS
+V = (LINES[::-1] + 0.5) / PIXELS / RAYS - REACH * UP
 # the rows of cubes that a line of rays may meet, the nearer one first; some are not there
-ROW = np.floor(V / UP + np.sqrt(2) * HALF).astype(int) - [[1], [0]]
+ROW = np.floor(V / UP + REACH).astype(int) - [[1], [0]]
 THERE = (ROW >= 0) & (ROW < ROWS)
 COLOURS = np.random.default_rng(1).uniform(0.2, 1, (ROWS, COLUMNS, 3))
 REFERENCE = np.random.default_rng(2).uniform(0.1, 0.9, SIZE)
@@ -73,8 +70,6 @@ def draw(y: Float[Array, "320"]) -> Float[Array, "48 100 3"]:
 
 def support():
     """Which values of the picture a parameter may change: those of pixels that may see its cube."""
-    from scipy import sparse
-
     height, _, width, _ = BY_PIXEL
     which, line = np.nonzero(THERE)
     row, column = ROW[which, line, None], np.arange(COLUMNS)[None]
@@ -85,19 +80,14 @@ def support():
     return sd.matrix_support(sparse.kron(seen.tocsr(), np.ones((3, 1))), (height, width, 3))
 
 
-def build(full: bool) -> Task:
-    return drawn(
-        "mosaic",
-        TASKS["mosaic"].title,
-        draw,
-        REFERENCE,
-        support=support(),
-        sigma=0.025,
-        budget=Budget(60_000, 900) if full else Budget(8000, 240),
-        seeds=10 if full else 2,
-        image=draw,
-        notes=f"{BY_PIXEL[2]} x {BY_PIXEL[0]} pixels of {RAYS} x {RAYS} rays",
-    )
-
-
-TASKS = {"mosaic": TaskEntry("Mosaic: rotations of 320 cubes", "program", build)}
+TASKS = program(
+    "mosaic",
+    "Mosaic: rotations of 320 cubes",
+    draw=draw,
+    reference=REFERENCE,
+    support=support,
+    sigma=0.025,
+    effort=(Effort(8000, 240, seeds=2), Effort(60_000, 900, seeds=10)),
+    image=draw,
+    notes=f"{BY_PIXEL[2]} x {BY_PIXEL[0]} pixels of {RAYS} x {RAYS} rays",
+)

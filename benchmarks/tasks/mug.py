@@ -61,7 +61,6 @@ def move_of_handle(y: Float[Array, "1"]) -> Float[Array, "3"]:
 # y is the angle in radians
 TURNED = {"handle.rotate": lambda y: y[0], "handle.translate": move_of_handle}
 
-
 TASKS = scene_entry(
     "mug",
     "Mug: rotation, told by the handle",

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from benchmarks._task import Budget, Task, TaskEntry
-from benchmarks.tasks._drawn import drawn
+from benchmarks._task import Effort
+from benchmarks.tasks._drawn import program
 
 PIXELS = 32
 # input -> the nodes from which an edge to it can come; the patterns are nodes 0 to 2
@@ -32,16 +32,10 @@ NOTHING = 0.3  # what an input without an edge is given
 DARK, LIGHT = (0.1, 0.05, 0.2), (0.95, 0.8, 0.5)
 
 
-def _patterns() -> np.ndarray:
-    """Bricks, rings and stripes, (3, H, W)."""
-    y, x = np.mgrid[0:PIXELS, 0:PIXELS] / PIXELS
-    shifted = x + np.floor(4 * y) % 2 / 4
-    bricks = (4 * y % 1 > 0.25) & (2 * shifted % 1 > 0.125)
-    rings = 0.5 + 0.5 * np.cos(8 * np.pi * np.hypot(x - 0.5, y - 0.5))
-    return np.stack([bricks, rings, (x + y) * 3 % 1])
-
-
-PATTERNS = _patterns()
+Y, X = np.mgrid[0:PIXELS, 0:PIXELS] / PIXELS
+BRICKS = (4 * Y % 1 > 0.25) & (2 * (X + np.floor(4 * Y) % 2 / 4) % 1 > 0.125)
+RINGS = 0.5 + 0.5 * np.cos(8 * np.pi * np.hypot(X - 0.5, Y - 0.5))
+PATTERNS = np.stack([BRICKS, RINGS, (X + Y) * 3 % 1])
 
 
 def edges(y: Float[Array, "24"]) -> Bool[Array, "24"]:
@@ -69,21 +63,16 @@ def draw(y: Float[Array, "24"]) -> Float[Array, "32 32 3"]:
     return dark + (light - dark) * shade
 
 
-def build(full: bool) -> Task:
-    """Starts are anywhere in the domain, so each edge is there or not by chance."""
-    return drawn(
-        "node-graph",
-        TASKS["node-graph"].title,
-        draw,
-        REFERENCE,
-        sigma=0.2,
-        budget=Budget(10_000, 240) if full else Budget(2000, 60),
-        seeds=10 if full else 3,
-        image=draw,
-        meaning=edges,
-        optimum=0.0,
-        notes=f"{PIXELS} x {PIXELS} pixels; an edge may have no effect",
-    )
-
-
-TASKS = {"node-graph": TaskEntry("Node graph: the edges of a procedural texture", "program", build)}
+# starts are anywhere in the domain, so each edge is there or not by chance
+TASKS = program(
+    "node-graph",
+    "Node graph: the edges of a procedural texture",
+    draw=draw,
+    reference=REFERENCE,
+    sigma=0.2,
+    effort=(Effort(2000, 60, seeds=3), Effort(10_000, 240, seeds=10)),
+    image=draw,
+    meaning=edges,
+    optimum=0.0,
+    notes=f"{PIXELS} x {PIXELS} pixels; an edge may have no effect",
+)

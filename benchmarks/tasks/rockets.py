@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from benchmarks._task import Budget, Task, TaskEntry
-from benchmarks.tasks._drawn import drawn, uniform
+from benchmarks._task import Effort
+from benchmarks.tasks._drawn import function, program, uniform
 
 SECONDS_PER_STEP = 0.02
 GRAVITY, DRAG = 9.81, 0.1
@@ -62,35 +62,21 @@ def fly10(y: Float[Array, "10"]) -> Float[Array, "10 2"]:
     return jax.lax.scan(push, (rest, rest), times, unroll=10)[0][0]
 
 
-def rocket(full: bool) -> Task:
-    """Starts are within a second of the reference."""
-    return drawn(
-        "rocket",
-        TASKS["rocket"].title,
-        fly,
-        REFERENCE,
-        sigma=0.4,
-        budget=Budget(3000, 60) if full else Budget(1000, 10),
-        seeds=20 if full else 3,
-        start=uniform(3, -1, 1, around=REFERENCE),
-        bounds=(0.0, 6.0),
-    )
-
-
-def rocket10(full: bool) -> Task:
-    return drawn(
-        "rocket10",
-        TASKS["rocket10"].title,
-        fly10,
-        REFERENCE10,
-        sigma=0.33,
-        budget=Budget(10_000, 240) if full else Budget(2000, 60),
-        seeds=10 if full else 3,
-        optimum=0.0,
-    )
-
-
-TASKS = {
-    "rocket": TaskEntry("Rocket: times at which the engine was switched", "function", rocket),
-    "rocket10": TaskEntry("Rocket10: when ten engines are switched off", "program", rocket10),
-}
+TASKS = function(
+    "rocket",
+    "Rocket: times at which the engine was switched",
+    draw=fly,
+    reference=REFERENCE,
+    sigma=0.4,
+    effort=(Effort(1000, 10, seeds=3), Effort(3000, 60, seeds=20)),
+    start=uniform(3, -1, 1, around=REFERENCE),
+    bounds=(0.0, 6.0),
+) | program(
+    "rocket10",
+    "Rocket10: when ten engines are switched off",
+    draw=fly10,
+    reference=REFERENCE10,
+    sigma=0.33,
+    effort=(Effort(2000, 60, seeds=3), Effort(10_000, 240, seeds=10)),
+    optimum=0.0,
+)

@@ -3,16 +3,16 @@
 After the Shadow task of higher-order differentiable rendering (section 4.1).
 """
 
+from typing import Any
+
 import jax.numpy as jnp
 
-from benchmarks._task import Budget, Score, Task, TaskEntry
+from benchmarks._task import Budget, Score, Task, entry
 from benchmarks.scenes import shadow
 from benchmarks.tasks._scene_task import scene_task
 
-TITLE = "Shadow: position of an unseen sphere"
 
-
-def build(full: bool, spp: int = 4) -> Task:
+def build(full: bool, spp: int = 4, **named: Any) -> Task:
     """Quick: 32 x 32 pixels; full: 64 x 64. `spp` are samples of a pixel."""
     from smoothdiff.renderers.mitsuba import available
 
@@ -23,8 +23,6 @@ def build(full: bool, spp: int = 4) -> Task:
     exact = image(reference)
     return scene_task(
         full,
-        name="shadow",
-        title=TITLE,
         scene=shadow.scene,
         params=shadow.PARAMS,
         reference=shadow.REFERENCE,
@@ -38,7 +36,8 @@ def build(full: bool, spp: int = 4) -> Task:
         ad_integrator={"type": "direct_projective"},
         photo=photo,
         score=Score(reference, lambda y: jnp.mean((image(y) - exact) ** 2), image),
+        **named,
     )
 
 
-TASKS = {"shadow": TaskEntry(TITLE, "scene", build)}
+TASKS = entry("scene", build, "shadow", "Shadow: position of an unseen sphere")

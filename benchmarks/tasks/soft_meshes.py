@@ -2,24 +2,34 @@
 
 After the meshes of higher-order differentiable rendering (section 4.1) and of ZeroGrads (supplement
 2.2): `suzanne` is a head with ears, of 2,562 vertices, `banana` has 2,737 and colours too. The
-rasteriser has hard edges, and no derivative of it is used. y are smooth coordinates of what the
-vertices have.
+rasteriser has hard edges, and no derivative of it is used. What vertices have, their positions
+or their colours, is, after Large Steps in Inverse Rendering of Geometry (Nicolet et al. 2021),
+
+    x = x₀ + c (I + λL)⁻¹ y,
+
+so that a step or a perturbation of y bends a surface and does not crumple it. The number c is such
+that noise of size 1 in y moves vertices by about 1.
 """
+
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from benchmarks._task import Budget, Problem, Score, Task, TaskEntry
-from benchmarks.scenes.mesh_renderer import look, views_around
+import smoothdiff as sd
+from benchmarks._task import Effort, Problem, Score, Task, entry
+from benchmarks.scenes.mesh_renderer import Views, edges_of, look, views_around
 from benchmarks.scenes.meshes import Faces, Positions, ball, icosphere
-from benchmarks.scenes.soft_mesh import TILE, Soft, support
-
-SUZANNE = "Suzanne: 7,686 coordinates of a mesh"
-BANANA = "Banana: 16,422 coordinates and colours of a mesh"
+from smoothdiff.filters._triangles import vertex_normals
 
 SIGMA, BOUND = 0.03, 0.3
+LAM = 19.0
+TILE = 2  # pixels, along each side of what is one term of the loss
+REACH = 0.15  # how far a perturbation is seen around a vertex
+BEHIND = 0.3  # the cosine of normals and the view, from where on a vertex is never seen
 EXTENT = 1.25  # what a view shows, from its middle
 
 SPHERE = 0.8  # radius at rest
@@ -45,15 +55,67 @@ YELLOW, GREEN, BROWN = (0.95, 0.8, 0.1), (0.35, 0.65, 0.15), (0.3, 0.18, 0.08)
 Fields = dict[str, Array]  # "positions", and "albedo" where it is sought too
 
 
-def suzanne(full: bool) -> Task:
+class Soft:
+    """Values at vertices, (vertices, channels), as a function of y, which is 0 for `rest`."""
+
+    def __init__(self, rest: np.ndarray, faces: Faces, gain: float = 1.0):
+        self._rest, self._faces = np.asarray(rest, np.float32), faces
+        self._smooth = sd.filters.mesh_laplacian(faces, LAM)
+        noise = self._smooth(jax.random.normal(jax.random.key(0), rest.shape), None)
+        self._gain = gain / float(jnp.std(noise))
+
+    def __call__(self, y: Float[Array, "vertices channels"]) -> Float[Array, "vertices channels"]:
+        """The values."""
+        return jnp.asarray(self._rest) + self._gain * self._smooth(y, None)
+
+    def coordinates(self, values: np.ndarray) -> np.ndarray:
+        """The y of given values."""
+        moved = (values - self._rest) / self._gain
+        i, j = edges_of(self._faces).ends.T
+        found, flow = moved.copy(), LAM * (moved[i] - moved[j])
+        np.add.at(found, i, flow)
+        np.add.at(found, j, -flow)
+        return found.astype(np.float32)
+
+
+def support(soft: Soft, faces: Faces, views: Views) -> Callable[[Any], Array]:
+    """Which tiles of the views a vertex may change: those near to where it is seen.
+
+    Smoothed perturbations only fade with the distance, so this is an approximation: about two
+    fifths of what a vertex changes are there.
+    """
+    tiles = views.size // TILE
+    half = views.extent / tiles
+    middles = jnp.asarray(half * (2 * np.arange(tiles) + 1) - views.extent, jnp.float32)
+    frames = jnp.asarray(views.frames, jnp.float32)
+
+    def around(y: dict[str, Array]) -> Callable[[dict[str, Array]], Array]:
+        positions = soft(y["positions"])
+        right, down, _ = jnp.einsum("vin,kn->ivk", frames, positions)
+        facing = jnp.einsum("vn,kn->vk", frames[:, 2], vertex_normals(positions, faces)) < BEHIND
+        across, along = (
+            jnp.maximum(jnp.abs(at[:, None] - middles[None, :, None]) - half, 0)
+            for at in (right, down)
+        )
+        near = along[:, :, None] ** 2 + across[:, None] ** 2 < REACH**2
+        matrix = (near & facing[:, None, None]).astype(positions.dtype)
+
+        def blame(y: dict[str, Array]) -> Float[Array, "views tiles tiles"]:
+            return matrix @ sum(jnp.sum(field, axis=1) for field in y.values())
+
+        return blame
+
+    return sd.moving_support(around)
+
+
+def suzanne(full: bool, **named: Any) -> Task:
     """y are coordinates of the positions."""
     directions, faces = icosphere(4)
-    positions = Soft(SPHERE * directions, faces), head(directions)
-    budget = Budget(40_000, 1200) if full else Budget(8000, 300)
-    return mesh_task(full, "suzanne", SUZANNE, faces, {"positions": positions}, budget)
+    fields = {"positions": (Soft(SPHERE * directions, faces), head(directions))}
+    return mesh_task(full, faces, fields, 8000, **named)
 
 
-def banana(full: bool) -> Task:
+def banana(full: bool, **named: Any) -> Task:
     """y are coordinates of the positions and of the colours, linear RGB."""
     directions, faces = ball(2737)
     rest = directions * ELLIPSOID
@@ -62,29 +124,22 @@ def banana(full: bool) -> Task:
         "positions": (Soft(rest, faces), bent(directions)),
         "albedo": (colours, painted(directions)),
     }
-    budget = Budget(40_000, 1200) if full else Budget(16_000, 300)
-    return mesh_task(full, "banana", BANANA, faces, fields, budget)
+    return mesh_task(full, faces, fields, 16_000, **named)
 
 
 def mesh_task(
     full: bool,
-    name: str,
-    title: str,
     faces: Faces,
     fields: dict[str, tuple[Soft, np.ndarray]],
-    budget: Budget,
+    evaluations: int,
+    **named: Any,
 ) -> Task:
-    """Quick: 6 views of 24 x 24 pixels; full: the 13 of ZeroGrads, of 32 x 32.
+    """`fields` are what vertices have, each as a function of its y, and what is sought.
 
-    Args:
-        full: As for all tasks.
-        name: Of the task.
-        title: What is sought.
-        faces: The triangles of the mesh.
-        fields: What vertices have, each as a function of its y, and what is sought.
-        budget: Where a run ends.
+    Quick: 6 views of 24 x 24 pixels, `evaluations`; full: the 13 of ZeroGrads, of 32 x 32.
     """
     number, size = (13, 32) if full else (6, 24)
+    much = Effort(40_000, 1200, seeds=5) if full else Effort(evaluations, 300, seeds=1)
     views = views_around(number, size)._replace(extent=EXTENT)
     soft = {field: of for field, (of, _) in fields.items()}
     reference = {field: jnp.asarray(of.coordinates(x)) for field, (of, x) in fields.items()}
@@ -109,21 +164,20 @@ def mesh_task(
 
     ends = jax.tree.map(lambda y: jnp.full_like(y, BOUND), reference)
     return Task(
-        name=name,
-        title=title,
         problem=Problem(
             bounds=(jax.tree.map(jnp.negative, ends), ends),
             sigma=SIGMA,
-            budget=budget,
+            budget=much.budget,
             residuals=residuals,
             terms=terms,
             support=support(soft["positions"], faces, views),
         ),
         score=Score(reference, image=lambda y: jnp.concatenate(list(pictures(y)[:4]), axis=1)),
         start=start,
-        seeds=5 if full else 1,
+        seeds=much.seeds,
         notes=f"{number} views of {size} x {size} pixels. Vertices may slide along the "
         "surface: the parameter error says nothing.",
+        **named,
     )
 
 
@@ -153,7 +207,6 @@ def painted(directions: Positions) -> np.ndarray:
     return (1 - brown) * colour + brown * np.array(BROWN)
 
 
-TASKS = {
-    "suzanne": TaskEntry(SUZANNE, "large", suzanne),
-    "banana": TaskEntry(BANANA, "large", banana),
-}
+TASKS = entry("large", suzanne, "suzanne", "Suzanne: 7,686 coordinates of a mesh") | entry(
+    "large", banana, "banana", "Banana: 16,422 coordinates and colours of a mesh"
+)

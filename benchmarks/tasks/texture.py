@@ -12,18 +12,11 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from benchmarks._descent import (
-    EPS,
-    Configuration,
-    Descent,
-    Filter,
-    Rate,
-    filtered,
-    problem,
-    variants,
-)
+from benchmarks import _descent
+from benchmarks._descent import Configuration, Descent, Filter, Rate, filtered, variants
 from benchmarks._task import Score, Task, TaskEntry
 from benchmarks.scenes import plate
+from benchmarks.scenes._monte_carlo import loss
 from smoothdiff.filters import bilateral, cross_bilateral, laplacian
 
 TITLE = "Roughness of a plate, one sample a pixel"
@@ -56,29 +49,30 @@ def build(full: bool) -> list[Task]:
         post._replace(title="Postfilter"),
         Configuration("both", "Both, of half the passes", tried(halved, around)),
     )
-    moments = (
-        post._replace(title="Both moments"),
-        *(
-            Configuration(f"{name}-only", f"{name} only", tried(guided, partial(one_moment, name)))
-            for name in ("m", "v")
-        ),
+    alone = lambda name: Configuration(
+        f"{name}-only", f"{name} only", tried(guided, partial(one_moment, name))
+    )
+    moments = (post._replace(title="Both moments"), alone("m"), alone("v"))
+    comparisons = (
+        ("filters", "", filters),
+        ("order", ": before or after the moments", order),
+        ("moments", ": one moment filtered, or both", moments),
     )
     return [
-        _descent("filters", TITLE, filters, size),
-        _descent("order", f"{TITLE}: before or after the moments", order, size),
-        _descent("moments", f"{TITLE}: one moment filtered, or both", moments, size),
+        descent(size, configurations, name=name, title=TITLE + what)
+        for name, what, configurations in comparisons
     ]
 
 
 TASKS = {"texture": TaskEntry(TITLE, "descent", build)}
 
 
-def _descent(name: str, title: str, configurations: tuple, size: int) -> Descent:
+def descent(size: int, configurations: tuple[Configuration, ...], **named: Any) -> Descent:
     start = jnp.full((size, size), START)
     return Descent(
-        name=name,
-        title=title,
-        problem=problem(gradient, partial(scene, size), start, MARKS[-1], plate.LOW, plate.HIGH),
+        problem=_descent.problem(
+            gradient, partial(scene, size), start, MARKS[-1], plate.LOW, plate.HIGH
+        ),
         score=Score(
             errors=errors, levels={"image error": (0.1, 0.03, 0.01), "roughness error": ()}
         ),
@@ -89,13 +83,11 @@ def _descent(name: str, title: str, configurations: tuple, size: int) -> Descent
         marks=MARKS,
         tuning_seeds=1,  # of a thousand texels' noise each
         pictures=pictures,
-        target=lambda scene: {
-            "roughness": scene["roughness"],
-            "picture": plate.exact(scene["roughness"], SCORED),
-        },
+        target=lambda scene: {"roughness": scene["roughness"], "picture": scene["scored"]},
         pictured=(25, 100),
         notes=f"{size} x {size} texels and pixels; 16 samples a pixel for the picture, 1 for the "
         "derivative. The image error is the squared one, relative to the start.",
+        **named,
     )
 
 
@@ -108,7 +100,7 @@ def scene(size: int) -> dict[str, jax.Array]:
         "roughness": roughness,
         "reference": plate.exact(roughness, SAMPLES),
         "scored": scored,
-        "loss": plate.loss(plate.exact(jnp.full((size, size), START), SCORED), scored),
+        "loss": loss(plate.exact(jnp.full((size, size), START), SCORED), scored),
     }
 
 
@@ -117,7 +109,7 @@ def gradient(y: jax.Array, key: jax.Array, scene: dict[str, jax.Array]) -> jax.A
 
 
 def errors(y: jax.Array, scene: dict[str, jax.Array]) -> dict[str, jax.Array]:
-    image = plate.loss(plate.exact(y, SCORED), scene["scored"]) / scene["loss"]
+    image = loss(plate.exact(y, SCORED), scene["scored"]) / scene["loss"]
     roughness = jnp.sqrt(jnp.mean((y - scene["roughness"]) ** 2))
     return {"image error": image, "roughness error": roughness}
 
@@ -144,6 +136,6 @@ def one_moment(
         top, bottom = (filter(m, params), v) if name == "m" else (m, filter(v, params))
         time = step.astype(m.dtype)
         top, bottom = top / (1 - b1**time), bottom / (1 - b2**time)
-        return -rate * top / (jnp.sqrt(bottom) + EPS), (step, m, v)
+        return -rate * top / (jnp.sqrt(bottom) + _descent.EPS), (step, m, v)
 
     return optax.GradientTransformation(init, update)

@@ -3,48 +3,42 @@
 Sigma and the starts are those of ZeroGrads (supplement, Table 1 and section 2.2).
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
-from benchmarks._task import Budget, Problem, Score, Task, TaskEntry
+from benchmarks._task import Effort, Problem, Score, Task, entry
 
 PIXELS = 256
 SHAPE = (PIXELS, PIXELS, 3)
 
 
-def _waves() -> np.ndarray:
-    """Waves in each channel, with an edge."""
-    y, x, channel = np.meshgrid(*(np.arange(n) / n for n in SHAPE), indexing="ij")
-    waves = np.sin(2 * np.pi * (2 * x + y + channel)) * np.cos(6 * np.pi * (x - 0.5) * y + channel)
-    return 0.5 + 0.4 * np.where(x + y < 1, waves, -waves)
+Y, X, CHANNEL = np.meshgrid(*(np.arange(n) / n for n in SHAPE), indexing="ij")
+WAVES = np.sin(2 * np.pi * (2 * X + Y + CHANNEL)) * np.cos(6 * np.pi * (X - 0.5) * Y + CHANNEL)
+REFERENCE = 0.5 + 0.4 * np.where(X + Y < 1, WAVES, -WAVES)  # with an edge
 
 
-REFERENCE = _waves()
-
-
-def build(full: bool) -> Task:
+def build(full: bool, **named: Any) -> Task:
     """Starts are grey with a little noise."""
     reference = jnp.asarray(REFERENCE, jnp.float32)
-    loss = lambda y: jnp.mean((y - reference) ** 2)
-
-    def terms(y: Float[Array, "256 256 3"]) -> Float[Array, "256 256 3"]:
-        return (y - reference) ** 2 / reference.size
-
+    much = Effort(100_000, 1200, seeds=10) if full else Effort(2000, 120, seeds=1)
     itself = lambda y: y
-    budget = Budget(100_000, 1200) if full else Budget(2000, 120)
-    bounds = jnp.zeros(SHAPE), jnp.ones(SHAPE)
     return Task(
-        "texture256",
-        TASKS["texture256"].title,
-        Problem(bounds, 0.025, budget, loss, terms=terms, support=itself),
-        Score(reference, image=itself),
+        problem=Problem(
+            (jnp.zeros(SHAPE), jnp.ones(SHAPE)),
+            0.025,
+            much.budget,
+            loss=lambda y: jnp.mean((y - reference) ** 2),
+            terms=lambda y: (y - reference) ** 2 / reference.size,
+            support=itself,
+        ),
+        score=Score(reference, image=itself),
         start=lambda seed: 0.5 + 0.05 * jax.random.normal(jax.random.key(seed), SHAPE),
-        seeds=10 if full else 1,
+        seeds=much.seeds,
+        **named,
     )
 
 
-TASKS = {
-    "texture256": TaskEntry("Texture256: 196,608 values of a texture", "program", build),
-}
+TASKS = entry("program", build, "texture256", "Texture256: 196,608 values of a texture")

@@ -8,31 +8,26 @@ Left out: all light but that of one point, and a texel is not mixed with its nei
 spread evenly in a pixel, or four of them would not tell where the edge of a texel is.
 """
 
-import dataclasses
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 import smoothdiff as sd
-from benchmarks._task import Budget, Task, TaskEntry
+from benchmarks._task import Budget, Task, entry
 from benchmarks.scenes.mitsuba_scene import DIRECT, Description, camera, flash
 from benchmarks.tasks._scene_task import scene_task
 
-TITLE = "Texture32: 1,024 texels of a tilted poster"
 SIDE = 32  # texels
 TILT = 30.0  # degrees, of the poster [-1, 1]², whose lower edge is the nearer one
 DISTANCE, FIELD = 4.2, 31.0  # of the camera from the middle; degrees
 
 
-def build(full: bool) -> Task:
+def build(full: bool, **named: Any) -> Task:
     """Starts are noise. Quick: 48 x 48 pixels; full: 64 x 64. y are the texels, row by row."""
     resolution, size = 64 if full else 48, SIDE**2
-    task = scene_task(
+    return scene_task(
         full,
-        name="texture32",
-        title=TITLE,
         scene=scene,
         params={"poster.bsdf.reflectance.data": lambda y: y.reshape(SIDE, SIDE, 1)},
         reference=texture().ravel(),
@@ -40,16 +35,11 @@ def build(full: bool) -> Task:
         start_box=([0.1] * size, [0.9] * size),
         sigma=0.2,  # of grey
         budget=Budget(20_000, 600) if full else Budget(4000, 120),
+        seeds=(2, 10),
         resolution=resolution,
+        support=support(resolution),
+        **named,
     )
-    residuals = task.problem.residuals
-    assert residuals is not None
-
-    def terms(y: Float[Array, "1024"]) -> Float[Array, "height width"]:
-        return jnp.mean(residuals(y) ** 2, axis=-1) / resolution**2
-
-    problem = dataclasses.replace(task.problem, terms=terms, support=support(resolution))
-    return dataclasses.replace(task, seeds=10 if full else 2, problem=problem)
 
 
 def scene(world: Any) -> Description:
@@ -103,4 +93,4 @@ def _meets(corners: np.ndarray) -> np.ndarray:
     return (low[..., None] <= texel) & (texel <= high[..., None])
 
 
-TASKS = {"texture32": TaskEntry(TITLE, "large", build)}
+TASKS = entry("large", build, "texture32", "Texture32: 1,024 texels of a tilted poster")

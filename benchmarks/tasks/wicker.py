@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from benchmarks._task import Budget, Task, TaskEntry
-from benchmarks.tasks._drawn import drawn
+from benchmarks._task import Effort
+from benchmarks.tasks._drawn import program
 
 PIXELS = 64
 FEWEST, CHOICES = np.array([2, 2, 1]), np.array([8, 8, 4])  # upright stakes, others, repetitions
@@ -44,20 +44,15 @@ def draw(y: Float[Array, "3"]) -> Float[Array, "64 64 3"]:
     return jnp.where((rim[None, :] | rim[:, None])[..., None], DARK, weave)
 
 
-def build(full: bool) -> Task:
-    return drawn(
-        "wicker",
-        TASKS["wicker"].title,
-        draw,
-        REFERENCE,
-        sigma=0.33,
-        budget=Budget(3000, 240) if full else Budget(600, 60),
-        seeds=10 if full else 3,
-        image=draw,
-        meaning=counts,
-        optimum=0.0,
-        notes=f"{PIXELS} x {PIXELS} pixels",
-    )
-
-
-TASKS = {"wicker": TaskEntry("Wicker: integer counts of a woven texture", "program", build)}
+TASKS = program(
+    "wicker",
+    "Wicker: integer counts of a woven texture",
+    draw=draw,
+    reference=REFERENCE,
+    sigma=0.33,
+    effort=(Effort(600, 60, seeds=3), Effort(3000, 240, seeds=10)),
+    image=draw,
+    meaning=counts,
+    optimum=0.0,
+    notes=f"{PIXELS} x {PIXELS} pixels",
+)

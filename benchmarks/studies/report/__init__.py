@@ -19,15 +19,11 @@ HELP = "the page of all scenes, or of some, from results"
 OPTIONS = ("names", "runs")
 
 
-def run(options: Namespace, runs: Path) -> None:
-    """Writes the page, and prints its tables.
-
-    Args:
-        options: The command line's: names, of scenes, and runs.
-        runs: The folder of what was run here, where the page goes.
-    """
+def run(options: Namespace, folder: Path) -> None:
+    """Writes the page beside the folder, and prints its tables."""
     from benchmarks.studies.report import _page
 
+    runs = folder.parent
     results = runs if options.runs else _study.COMMITTED
     found = {name: load(name, results) for name in options.names or _registry.scenes()}
     for name in (name for name, scene in found.items() if scene is None):
@@ -45,12 +41,9 @@ def run(options: Namespace, runs: Path) -> None:
 
 def overall_of(scenes: Sequence[Scene]) -> list[Grid]:
     """The tables of all scenes together."""
-    plateaus = [scene for scene in scenes if scene.plateau]
-    others = [scene for scene in scenes if not scene.plateau]
     grids = [_tables.of_scenes(scenes), _tables.over(scenes, "all scenes")]
-    if plateaus and others:
-        grids += [
-            _tables.over(plateaus, "scenes with plateaus"),
-            _tables.over(others, "scenes without"),
-        ]
+    if len({scene.plateau for scene in scenes}) > 1:
+        for plateau, which in ((True, "scenes with plateaus"), (False, "scenes without")):
+            some = [scene for scene in scenes if scene.plateau == plateau]
+            grids.append(_tables.over(some, which))
     return grids

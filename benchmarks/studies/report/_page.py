@@ -2,7 +2,6 @@
 
 import base64
 import io
-import json
 from collections.abc import Sequence
 from html import escape
 from importlib import import_module
@@ -13,8 +12,9 @@ from PIL import Image
 from benchmarks import _atlas, _registry
 from benchmarks._grid import Grid, to_html
 from benchmarks._pictures import LABELS, ours_of, panel
+from benchmarks._study import committed
 from benchmarks._style import STYLE, looks, plt
-from benchmarks._summary import COSTS
+from benchmarks._summary import COSTS, unable
 from benchmarks.studies.report import _tables
 from benchmarks.studies.report._scene import ERRORS, OURS, RULE_TEXT, Scene, all_methods
 
@@ -34,15 +34,9 @@ Look = dict[str, dict]
 
 
 def page(scenes: Sequence[Scene], overall: Sequence[Grid], results: Path) -> str:
-    """The whole page.
+    """The whole page, which needs no other file.
 
-    Args:
-        scenes: What was run.
-        overall: The tables of all scenes together.
-        results: The folder of results, for what was found about savings and robustness.
-
-    Returns:
-        HTML that needs no other file.
+    The folder of results is for what was found about savings and robustness.
     """
     look = _look(scenes)
     swatches = {name: _swatch(line["color"], line["linestyle"]) for name, line in look.items()}
@@ -68,10 +62,8 @@ def page(scenes: Sequence[Scene], overall: Sequence[Grid], results: Path) -> str
 
 def _machine(scene: Scene) -> str:
     machine = scene.about["machine"]
-    versions = ("smoothdiff", "jax", "mitsuba")
-    packages = ", ".join(
-        f"{p} {machine['versions'][p]}" for p in versions if p in machine["versions"]
-    )
+    known = [p for p in ("smoothdiff", "jax", "mitsuba") if p in machine["versions"]]
+    packages = ", ".join(f"{p} {machine['versions'][p]}" for p in known)
     return f"{machine['cores']} cores of {machine['cpu']}, Python {machine['python']}, {packages}"
 
 
@@ -79,11 +71,7 @@ def _section(scene: Scene, look: Look, swatches: dict[str, str]) -> str:
     results = scene.results
     budget = results["budget"]
     parameters = f"{results['dimensions']:,} parameter{'s' * (results['dimensions'] != 1)}"
-    not_able = " ".join(
-        f"{found['title']}: {found['not_able']}."
-        for found in results["methods"].values()
-        if "not_able" in found
-    )
+    not_able = " ".join(f"{title}: {why}." for title, why in unable(results).items())
     parts = [
         f'<section id="{scene.name}"><h2>{escape(results["title"])}</h2>',
         f"<p>{parameters}, sigma {results['sigma']:g}, at most {budget['evaluations']:,} "
@@ -117,14 +105,10 @@ def _pictures(scene: Scene) -> str:
     cards = [
         _card("Reference", [pictures.reference]),
         _card("Start", [pictures.start, away[""]]),
-        *(
-            _card(
-                f"{scene.ran[name]['title']}: {scene.ran[name]['first']:.2g}",
-                [pictures.found[name], away[name]],
-            )
-            for name in sorted(scene.ran, key=lambda name: name != scene.ours)
-        ),
     ]
+    for name in sorted(scene.ran, key=lambda name: name != scene.ours):
+        caption = f"{scene.ran[name]['title']}: {scene.ran[name]['first']:.2g}"
+        cards.append(_card(caption, [pictures.found[name], away[name]]))
     return (
         "<figure><figcaption>The first start: what each method found, how far it is from the "
         "reference (white is as far as the start), and the image error that is left."
@@ -133,9 +117,7 @@ def _pictures(scene: Scene) -> str:
 
 
 def _card(caption: str, pictures: list) -> str:
-    shown = "".join(
-        f'<img alt="" src="{_atlas.data_uri(_atlas.png(picture))}">' for picture in pictures
-    )
+    shown = "".join(f'<img alt="" src="{_atlas.data_uri(_atlas.png(of))}">' for of in pictures)
     kind = " class=single" if len(pictures) == 1 else ""
     return f"<figure{kind}>{shown}<figcaption>{escape(caption)}</figcaption></figure>"
 
@@ -187,9 +169,8 @@ def _panel(scene: Scene, look: Look, error: str, cost: str) -> str:
 
 def _study(name: str, results: Path) -> str:
     """The tables of a study of scenes, where it was run."""
-    path = results / name / "results.json"
-    if not path.exists():
+    found = committed(name, results)
+    if found is None:
         return ""
-    study = _registry.studies()[name]
-    grids = study.tables(json.loads(path.read_text()))
-    return f"<h2>{name.capitalize()}</h2>" + "".join(to_html(grid, {}) for grid in grids)
+    shown = (to_html(grid, {}) for grid in _registry.studies()[name].tables(found))
+    return f"<h2>{name.capitalize()}</h2>" + "".join(shown)

@@ -8,12 +8,12 @@ written, whose settings had been chosen on suzanne and banana. Those of grey_gau
 cnn5.
 """
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks import _registry
+from benchmarks._study import committed
 from benchmarks._summary import able
 
 FEW = 300  # parameters
@@ -90,10 +90,9 @@ class Scene(NamedTuple):
 
 def load(name: str, results: Path) -> Scene | None:
     """What was run on a scene, by the folder of all results; None where nothing was."""
-    path = results / name / "results.json"
-    if not path.exists():
+    found = committed(name, results)
+    if found is None:
         return None
-    found = json.loads(path.read_text())
     scene = Scene(name, next(iter(found.pop("tasks").values())), found)
     return scene if scene.ran else None
 

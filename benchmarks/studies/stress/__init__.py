@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks._grid import Grid
-from benchmarks._style import COLOURS, figure
-from benchmarks.studies._listed import listed
+from benchmarks.studies._listed import dots, listed
 from benchmarks.studies.stress import faults, memory, scales, shapes, simulator
 from benchmarks.studies.stress._check import Check
 
@@ -83,16 +82,7 @@ def tables(results: dict[str, Any]) -> Iterator[Grid]:
 
 def draw(results: dict[str, Any], folder: Path) -> None:
     """All checks, each over its limit."""
-    least, most = 1e-6, 1e2
-    rows = list(_alike(results))
-    with figure(folder / "stress.png", 1, 1, (8, 0.26 * len(rows) + 1)) as (_, axes):
-        axis = axes[0, 0]
-        for place, (_, checks) in enumerate(rows):
-            ratios = np.clip([_ratio(check) for check in checks], least, most)
-            colours = [COLOURS[1] if check["holds"] else COLOURS[0] for check in checks]
-            axis.scatter(ratios, [place] * len(checks), s=16, c=colours, alpha=0.6, lw=0)
-        axis.axvline(1, color="0.3", lw=0.8)
-        names = [f"{name}: {checks[0]['unit']}" for name, checks in rows]
-        axis.set(xscale="log", xlim=(least / 2, most * 2), ylim=(len(rows) - 0.4, -0.6))
-        axis.set(yticks=range(len(rows)), yticklabels=names)
-        axis.set(xlabel="Seen over the most that it may be")
+    rows: dict[str, list[float]] = {}
+    for name, checks in _alike(results):
+        rows.setdefault(f"{name}: {checks[0]['unit']}", []).extend(map(_ratio, checks))
+    dots(folder / "stress.png", rows, 1, "Seen over the most that it may be", (1e-6, 1e2))

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.studies.variance import descent, fits, replicates, targets
+from benchmarks.studies.variance import costs, descent, targets
 from benchmarks.studies.variance.errors import Case, Row, case, relative_rmse, rows
 from benchmarks.studies.variance.estimators import ANYWHERE, ESTIMATORS, Estimator
 from benchmarks.studies.variance.pictures import draw
@@ -54,8 +54,8 @@ def measure(options: Namespace, folder: Path) -> dict[str, Any]:
     }
     if options.full:
         box10 = case("box10", repeats["box10"])
-        results["replicates"] = replicates.run(box10)
-        results["fits"] = fits.run(box10, problems["box10"]["estimators"])
+        results["replicates"] = costs.replicates(box10)
+        results["fits"] = costs.fits(box10, problems["box10"]["estimators"])
     return results
 
 

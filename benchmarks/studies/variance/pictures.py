@@ -2,11 +2,11 @@
 
 from collections.abc import Collection
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks._style import COLOURS, figure, looks
+from benchmarks._style import COLOURS, band, figure, headed, looks
 from benchmarks.studies.variance.descent import LEVELS
 from benchmarks.studies.variance.estimators import INGREDIENTS, PEERS
 
@@ -14,69 +14,63 @@ COSTS = {"evaluations": "Evaluations", "ms": "Milliseconds of a call"}
 QUANTITIES = {"gradient": "Gradient", "hessian": "Hessian", "hvp": "Hessian-vector product"}
 
 
+class Panel(NamedTuple):
+    """Errors of a quantity on a problem against what they cost."""
+
+    title: str
+    estimators: dict[str, Any]
+    quantity: str
+    cost: str
+
+
 def draw(results: dict[str, Any], folder: Path) -> None:
     """A picture of each problem, of what the ingredients of ours give, and of the descent."""
-    problems = results["problems"]
-    for name, problem in problems.items():
-        _problem(problem, folder / f"{name}.png")
-    _ingredients({name: problems[name] for name in ("box2", "box10")}, folder / "ingredients.png")
+    found = {name: problem["estimators"] for name, problem in results["problems"].items()}
+    for name, of in found.items():
+        known = [quantity for quantity in QUANTITIES if quantity in of["ours"]]
+        panels = [Panel(QUANTITIES[q], of, q, cost) for cost in COSTS for q in known]
+        title = results["problems"][name]["title"]
+        _errors(panels, len(known), PEERS, folder / f"{name}.png", title)
+    panels = [
+        Panel(f"{name.capitalize()}: {QUANTITIES[q].lower()}", found[name], q, "evaluations")
+        for q in ("gradient", "hessian")
+        for name in ("box2", "box10")
+    ]
+    parts = ("gaussian-mean", "sobol-mean", *INGREDIENTS)
+    _errors(panels, 2, parts, folder / "ingredients.png")
     _descent(results["descent"], folder / "descent.png")
 
 
-def _problem(problem: dict[str, Any], path: Path) -> None:
-    """Error against evaluations above, against time below."""
-    quantities = [q for q in QUANTITIES if q in problem["estimators"]["ours"]]
-    with figure(path, 2, len(quantities), (3.2 * len(quantities) + 1, 6.2)) as (drawn, axes):
-        for line, cost in zip(axes, COSTS, strict=True):
-            for axis, quantity in zip(line, quantities, strict=True):
-                _lines(axis, problem, PEERS, quantity, cost)
-                axis.set_title(QUANTITIES[quantity])
-        _finish(drawn, axes, min(4, 1 + len(quantities)))
-        drawn.suptitle(problem["title"], x=0.01, ha="left", fontsize=10)
-
-
-def _ingredients(boxes: dict[str, Any], path: Path) -> None:
-    parts = ("gaussian-mean", "sobol-mean", *INGREDIENTS)
-    with figure(path, 2, len(boxes), (3.6 * len(boxes) + 0.5, 6.2)) as (drawn, axes):
-        for line, quantity in zip(axes, ("gradient", "hessian"), strict=True):
-            for axis, (name, problem) in zip(line, boxes.items(), strict=True):
-                _lines(axis, problem, parts, quantity, "evaluations")
-                axis.set_title(f"{name.capitalize()}: {QUANTITIES[quantity].lower()}")
-        _finish(drawn, axes, 3)
-
-
-def _lines(axis: Any, problem: dict, names: Collection[str], quantity: str, cost: str) -> None:
-    look = looks(names)
-    for name in names:
-        estimator = problem["estimators"].get(name, {})
-        if quantity in estimator:
-            title, curve = estimator["title"], estimator[quantity].values()
-            taken = [at[cost] for at in curve]
-            low, middle, high = np.array([at["rmse"] for at in curve]).T
-            width = 2.6 if title.startswith("Ours") else 1.3
-            axis.plot(taken, middle, label=title, lw=width, **look[name])
-            axis.fill_between(taken, low, high, color=look[name]["color"], alpha=0.12, lw=0)
-    axis.set(xscale="log", yscale="log", xlabel=COSTS[cost])
-
-
-def _finish(drawn: Any, axes: np.ndarray, columns: int) -> None:
-    """One legend for all axes, each line once."""
-    found: dict[str, Any] = {}
-    for axis in axes.flat:
-        handles, labels = axis.get_legend_handles_labels()
-        found |= dict(zip(labels, handles, strict=True))
-    drawn.legend(found.values(), found, loc="outside lower center", ncols=columns, fontsize=8)
-    for axis in axes[:, 0]:
-        axis.set_ylabel("Relative RMSE")
+def _errors(
+    panels: list[Panel], abreast: int, names: Collection[str], path: Path, title: str = ""
+) -> None:
+    """Of the named estimators, two rows of panels; one legend for all, each line once."""
+    look, shown = looks(names), {}
+    with figure(path, 2, abreast, (3.2 * abreast + 1, 6.2)) as (drawn, axes):
+        for axis, panel in zip(axes.flat, panels, strict=True):
+            for name in names:
+                estimator = panel.estimators.get(name, {})
+                if panel.quantity in estimator:
+                    label, curve = estimator["title"], estimator[panel.quantity].values()
+                    line = look[name] | {"lw": 2.6 if label.startswith("Ours") else 1.3}
+                    taken = [at[panel.cost] for at in curve]
+                    band(axis, taken, np.transpose([at["rmse"] for at in curve]), line, label, 0.12)
+            axis.set(xscale="log", yscale="log", xlabel=COSTS[panel.cost], title=panel.title)
+            handles, labels = axis.get_legend_handles_labels()
+            shown |= dict(zip(labels, handles, strict=True))
+        for axis in axes[:, 0]:
+            axis.set_ylabel("Relative RMSE")
+        ncols = min(4, 1 + abreast)
+        drawn.legend(shown.values(), shown, loc="outside lower center", ncols=ncols, fontsize=8)
+        headed(drawn, title)
 
 
 def _descent(lines: list[dict[str, Any]], path: Path) -> None:
     with figure(path, 1, 1, (4.5, 3)) as (_, axes):
         axis = axes[0, 0]
         for line, colour in zip(lines, COLOURS, strict=False):
-            evaluations, (low, middle, high) = line["curve"].values()
-            axis.plot(evaluations, middle, color=colour, label=f"{line['credit']} credit")
-            axis.fill_between(evaluations, low, high, color=colour, alpha=0.2, lw=0)
+            costs, errors = line["curve"].values()
+            band(axis, costs, errors, {"color": colour}, f"{line['credit']} credit", 0.2)
         for level in LEVELS.values():
             axis.axhline(level, color="0.6", lw=0.6, ls=":", zorder=0)
         axis.set(xscale="log", yscale="log", xlabel="Evaluations")

@@ -25,11 +25,7 @@ TARGETS: dict[tuple[str, str, int], dict[str, float]] = {
 
 
 def against_targets(measured: dict[str, Rows]) -> list[dict[str, Any]]:
-    """For each target: the RMSE of each opponent over ours, with its interval, and the goal.
-
-    Args:
-        measured: By problem.
-    """
+    """For each target: the RMSE of each opponent over ours, with its interval, and the goal."""
     lines = []
     for (problem, quantity, num), least in TARGETS.items():
         line: dict[str, Any] = {"problem": problem, "quantity": quantity, "samples": num}

@@ -15,9 +15,17 @@ from benchmarks import _registry
 from benchmarks._grid import Grid, Row, short
 from benchmarks._loop import Run
 from benchmarks._task import Method
-from benchmarks.studies.zerograds._panels import curves, panels, sized
-from benchmarks.studies.zerograds._runs import BUDGETS, about, errors, load, ran
-from benchmarks.studies.zerograds._solvers import configuration
+from benchmarks.studies.zerograds._runs import (
+    BUDGETS,
+    about,
+    configuration,
+    curves,
+    errors,
+    load,
+    panels,
+    ran,
+    sized,
+)
 from smoothdiff import surrogates
 
 CHANGES: dict[str, dict[str, Any]] = {

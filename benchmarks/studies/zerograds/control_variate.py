@@ -18,10 +18,9 @@ from tqdm import trange
 
 import smoothdiff as sd
 from benchmarks._grid import Grid, Row, short
+from benchmarks._summary import quarters
 from benchmarks._task import Problem, Task
-from benchmarks.studies.zerograds._panels import curves, panels
-from benchmarks.studies.zerograds._runs import BUDGETS, load, quartiles
-from benchmarks.studies.zerograds._solvers import Steps, ours
+from benchmarks.studies.zerograds._runs import BUDGETS, Steps, curves, load, ours, panels
 
 TASKS = ("rocket10", "led")
 SHARES = (0.05, 0.25, 0.5, 1.0)  # of a run: where gradients are looked at
@@ -40,7 +39,7 @@ def measure(starts: int, folder: Path, fresh: bool) -> dict[str, Any]:
         task, bar = load(name), trange(starts, desc=f"{name}: control variate", unit="run")
         runs = [along(task, seed) for seed in bar]
         tasks[name] = {"evaluations": [share * BUDGETS[name] for share in SHARES]}
-        tasks[name] |= {each: quartiles([run[each] for run in runs]) for each in BASELINES}
+        tasks[name] |= {each: quarters([run[each] for run in runs]) for each in BASELINES}
     return {"samples": NUM_SAMPLES, "repeats": REPEATS, "tasks": tasks}
 
 
@@ -50,12 +49,10 @@ def along(task: Task, seed: int) -> dict[str, list[float]]:
     steps, key = Steps(solver, task.problem), jax.random.key(seed)
     ratios = {name: jax.jit(_ratio(task.problem, solver, name)) for name in BASELINES}
     found: dict[str, list[float]] = {name: [] for name in BASELINES}
-    ends = {round(share * steps.number) for share in SHARES}
-    for done, (y, state) in enumerate(steps(task.start(seed), key)):
-        if done in ends:
-            unused = jax.random.fold_in(key, steps.number + done)  # by the steps of the run
-            for name, ratio in ratios.items():
-                found[name].append(float(ratio(unused, y, state)))
+    for done, y, state in steps.at(SHARES, task.start(seed), key):
+        unused = jax.random.fold_in(key, steps.number + done)  # by the steps of the run
+        for name, ratio in ratios.items():
+            found[name].append(float(ratio(unused, y, state)))
     return found
 
 

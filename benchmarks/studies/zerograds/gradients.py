@@ -25,12 +25,10 @@ import smoothdiff as sd
 from benchmarks import _registry
 from benchmarks._grid import Grid, Row, short
 from benchmarks._kept import fingerprint, kept
+from benchmarks._summary import quarters
 from benchmarks._task import Problem, Task
-from benchmarks.methods import fr22
-from benchmarks.methods._adam import optimiser
-from benchmarks.studies.zerograds._panels import curves, panels
-from benchmarks.studies.zerograds._runs import BUDGETS, load, quartiles
-from benchmarks.studies.zerograds._solvers import SOURCE, Steps, ours
+from benchmarks.methods import adam
+from benchmarks.studies.zerograds._runs import BUDGETS, SOURCE, Steps, curves, load, ours, panels
 
 TASKS = ("rocket10", "led")
 WINDOWS = 20  # of a run: a variance and a cosine for each
@@ -61,17 +59,11 @@ def kept_gradient() -> optax.GradientTransformation:
 
 def solver(name: str, problem: Problem) -> Any:
     """A solver whose optimiser has the last gradient as `opt_state[0]`."""
+    keep = lambda optim: optax.chain(kept_gradient(), optim)
     if name == "ours":
-        keep = lambda optim: optax.chain(kept_gradient(), optim)
         return eqx.tree_at(lambda solver: solver.optimizer, ours(problem), replace_fn=keep)
-    steps = problem.budget.evaluations // fr22.NUM_SAMPLES
-    return sd.FirstOrder(
-        optax.chain(kept_gradient(), optimiser(problem, fr22.NUM_SAMPLES)),
-        optax.linear_schedule(problem.sigma, fr22.SIGMA_END * problem.sigma, steps),
-        num_samples=fr22.NUM_SAMPLES,
-        sampler=(Signs if name == "spsa" else sd.Gaussian)(antithetic=True),
-        baseline="none",
-    )
+    found = adam.fr22_solver(problem, Signs if name == "spsa" else sd.Gaussian)
+    return eqx.tree_at(lambda solver: solver.optim, found, replace_fn=keep)
 
 
 def measure(starts: int, folder: Path, fresh: bool) -> dict[str, Any]:
@@ -86,7 +78,7 @@ def measure(starts: int, folder: Path, fresh: bool) -> dict[str, Any]:
             for seed in trange(starts, desc=f"{task_name}: {name}", unit="run"):
                 path = folder / task_name / f"gradient-{name}-{seed}.npz"
                 runs.append(kept(path, _fingerprint(task, seed), partial(follow, seed), fresh))
-            tasks[task_name][name] = {row: quartiles([run[row] for run in runs]) for row in ROWS}
+            tasks[task_name][name] = {row: quarters([run[row] for run in runs]) for row in ROWS}
     return {"tasks": tasks}
 
 

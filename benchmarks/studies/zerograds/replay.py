@@ -11,9 +11,16 @@ from typing import Any
 from benchmarks._grid import Grid, Row, short
 from benchmarks._loop import Run
 from benchmarks._summary import cost_to_level, quartiles
-from benchmarks.studies.zerograds._panels import curves, panels, sized
-from benchmarks.studies.zerograds._runs import about, errors, load, ran
-from benchmarks.studies.zerograds._solvers import configuration
+from benchmarks.studies.zerograds._runs import (
+    about,
+    configuration,
+    curves,
+    errors,
+    load,
+    panels,
+    ran,
+    sized,
+)
 
 TASKS = ("rocket10", "wicker", "node-graph", "led")
 TITLES = {"100": "100 batches seen again", "0": "none"}

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks._grid import Grid, Row, short
-from benchmarks.studies.zerograds._panels import curves, panels
-from benchmarks.studies.zerograds._runs import BUDGETS, load, quartiles, ran
-from benchmarks.studies.zerograds._solvers import configuration
+from benchmarks._summary import quarters
+from benchmarks.studies.zerograds._runs import BUDGETS, configuration, curves, load, panels, ran
 
 NUMBERS = {"led": (2, 4, 8, 16), "rocket10": (2, 4, 8, 16, 32)}
 FLOOR = 1e-6  # the smallest error that is drawn
@@ -23,7 +22,7 @@ def measure(starts: int, folder: Path, fresh: bool) -> dict[str, Any]:
     for name, numbers in NUMBERS.items():
         methods = [configuration(f"samples-{number}", num_samples=number) for number in numbers]
         runs = ran(load(name), methods, starts, folder, fresh).values()
-        errors = [quartiles([run["image_error"][-1] for run in each]) for each in runs]
+        errors = [quarters([run["image_error"][-1] for run in each]) for each in runs]
         tasks[name] = {"evaluations": BUDGETS[name], "samples": numbers, "errors": errors}
     return {"tasks": tasks}
 

@@ -12,9 +12,7 @@ import smoothdiff as sd
 from benchmarks._grid import Grid, Row
 from benchmarks._style import COLOURS
 from benchmarks._task import Budget, Problem
-from benchmarks.studies.zerograds._panels import panels
-from benchmarks.studies.zerograds._runs import PLENTY
-from benchmarks.studies.zerograds._solvers import Steps, ours
+from benchmarks.studies.zerograds._runs import PLENTY, Steps, ours, panels
 from smoothdiff.surrogates import MLP
 
 SHOWN = (0.0, 0.1, 0.35, 1.0)  # of the iterations, as in the paper
@@ -55,27 +53,26 @@ def measure(starts: int, folder: Path, fresh: bool) -> dict[str, Any]:
     )
     solver = ours(problem, surrogate=MLP(1, key=jax.random.key(1)))
     steps = Steps(solver, problem)
-    marks = {round(share * steps.number): share for share in SHOWN}
+    along = steps.at(SHOWN, jnp.asarray(START, jnp.float32), jax.random.key(0))
     frames = []
-    for done, (y, state) in enumerate(steps(jnp.asarray(START, jnp.float32), jax.random.key(0))):
-        if done in marks:
-            at, sigma = float(y), min(float(state.progress.sigma), SIGMA)  # infinite at first
-            learnt = jax.vmap(solver.learnt(state, y))
-            heights = np.asarray(learnt(jnp.asarray([at, *COARSE], jnp.float32)), float)
-            smooth = float(smoothed(at, sigma))
-            frames.append(
-                {
-                    "share": marks[done],
-                    "evaluations": len(seen),
-                    "y": at,
-                    "loss": float(loss(at)),
-                    "sigma": sigma,
-                    "smoothed": smooth,
-                    "samples": seen[-LAST:],
-                    # it learns differences only, so it is as high as the smoothed loss at y
-                    "surrogate": (heights[1:] - heights[0] + smooth).tolist(),
-                }
-            )
+    for share, (_, y, state) in zip(SHOWN, along, strict=True):
+        at, sigma = float(y), min(float(state.progress.sigma), SIGMA)  # infinite at first
+        learnt = jax.vmap(solver.learnt(state, y))
+        heights = np.asarray(learnt(jnp.asarray([at, *COARSE], jnp.float32)), float)
+        smooth = float(smoothed(at, sigma))
+        frames.append(
+            {
+                "share": share,
+                "evaluations": len(seen),
+                "y": at,
+                "loss": float(loss(at)),
+                "sigma": sigma,
+                "smoothed": smooth,
+                "samples": seen[-LAST:],
+                # it learns differences only, so it is as high as the smoothed loss at y
+                "surrogate": (heights[1:] - heights[0] + smooth).tolist(),
+            }
+        )
     return {"reference": REFERENCE, "frames": frames}
 
 
