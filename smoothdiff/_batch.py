@@ -13,13 +13,15 @@ from smoothdiff._baselines import AbstractBaseline, Control
 from smoothdiff._draws import Draws
 from smoothdiff._params import Layout, Params
 from smoothdiff._samplers import AbstractSampler
+from smoothdiff._seen import Seen
 from smoothdiff._support import AbstractSupport, check_support
 
 
 class Batch(eqx.Module):
     """Points with the function's values there; arrays only, so that it crosses jit and scan.
 
-    `values` and `aux` have one leading row per sample. `scale` is one over the number of samples
+    `values` and `aux` have one leading row per sample; an aux that is `Seen` has one per chunk, the
+    lowest. `scale` is one over the number of samples
     that count, or NaN where the estimate is void. `valid` marks the samples that count, None if
     all do. `layout` says which parameter is where in a point.
     """
@@ -74,6 +76,9 @@ def evaluate(
 
     def rows(z: Array, log_ratio: Array | None):
         values, aux = jax.vmap(row, in_axes=(0, None if free_rows is None else 0))(z, free)
+        if isinstance(aux, Seen):
+            # here, so that points need no more memory than a chunk of them
+            aux = jax.tree.map(lambda a: a[None], aux.lowest())
         return values, aux, log_ratio
 
     values, aux, log_ratio = draws.map(rows)

@@ -46,7 +46,7 @@ def minimise(
         key: a random key; the same key gives the same run.
         solver: how to step, such as `FirstOrder(optax.adam(0.1), sigma)`.
         max_evaluations: evaluations of `fun` that are never exceeded. Those that judge the result
-            are set aside first.
+            are set aside first, as many as noise would ask for; without noise some are left over.
         max_steps: steps after which to stop. By default 256, or no limit if `max_evaluations` is
             given.
         bounds: a pair (low, high), each a number or a pytree like `y0`. `fun` sees no other points.
@@ -116,7 +116,7 @@ def least_squares(
         checkpoint: as for `minimise`.
 
     Returns:
-        A `Result`, whose `fun` is half the sum of squares, smoothed.
+        A `Result`, whose `fun` is half the sum of squares.
 
     Raises:
         MinimiseError: a black box failed, or an estimate was NaN or infinite. Nothing is lost: its

@@ -55,10 +55,15 @@ class Result:
     """What `minimise` found.
 
     Attributes:
-        y: the best point, judged on fresh samples. If the run was cut short ("interrupted", or an
-            error) there were none: then the point of lowest estimate, which may be luck.
-        fun: the smoothed function there.
-        stderr: the standard error of `fun`.
+        y: the best point. Of a function without noise, always the lowest that was evaluated. With
+            noise, found by evaluating that point again, the winner of fresh evaluations of a few
+            candidates, the start among them. If the run was cut short ("interrupted", or an error)
+            the lowest that was evaluated, which with noise may be luck.
+        fun: the function there; of least squares half the sum of squares. With noise, the mean of
+            three fresh evaluations.
+        smoothed: the smoothed function there, from a last batch; a point of that batch which is
+            lower still has become `y`. NaN if the run was cut short, or if a sample was not finite.
+        stderr: the standard error of `smoothed`.
         evaluations: evaluations of the function, the judgement included; not those of a step that
             was broken off.
         reason: why the run stopped: "max_steps", "max_evaluations", "callback", "interrupted", or
@@ -68,6 +73,7 @@ class Result:
 
     y: PyTree[Array]
     fun: float
+    smoothed: float
     stderr: float
     evaluations: int
     reason: str
@@ -219,16 +225,18 @@ class Run:
         """The result of a run that ended well."""
         with reraise():
             y, stats = jax.block_until_ready(self.problem.judge(self.y, self.state))
+        # a last batch that fails costs no more than the smoothed value
         if not jnp.isfinite(stats["fun"]):
             raise MinimiseError(_NONFINITE, self.found("nonfinite"))
-        fun, stderr, evaluations = (stats[name].item() for name in ("fun", "stderr", "evaluations"))
-        return Result(y, fun, stderr, evaluations, reason, self.history)
+        numbers = {name: value.item() for name, value in stats.items()}
+        return Result(y=y, reason=reason, history=self.history, **numbers)
 
     def found(self, reason: str, progress: Progress | None = None) -> Result:
         """The result of a run that was cut short: no evaluation is made for it."""
         p = progress or self.state.progress
-        fun, stderr, evaluations = (a.item() for a in (p.best_fun, p.best_stderr, p.evaluations))
-        return Result(p.best_y, fun, stderr, evaluations, reason, self.history[: self.steps])
+        fun, evaluations, unknown = p.lowest_fun.item(), p.evaluations.item(), float("nan")
+        history = self.history[: self.steps]
+        return Result(p.lowest_y, fun, unknown, unknown, evaluations, reason, history)
 
 
 class Limits(NamedTuple):

@@ -11,7 +11,8 @@ import optimistix as optx
 import pytest
 
 import smoothdiff as sd
-from smoothdiff._solvers._base import Progress, judge, project
+from smoothdiff._seen import Seen
+from smoothdiff._solvers._base import Progress, project
 
 KEY = jax.random.key(2)
 TARGET = jnp.array([0.6, -0.4])
@@ -68,7 +69,7 @@ def test_crosses_plateaus_in_both_precisions(dtype):
     # the lowest plateau is the square of half-width 1/8 around the target
     np.testing.assert_allclose(solution.value, TARGET, atol=0.06)
     assert solution.result == MAX_STEPS
-    assert solution.stats["evaluations"] == 200 * 8 + 3 * 8
+    assert solution.stats["evaluations"] == 200 * 8 + 5 + 8
 
 
 def test_gradient_descent_follows_the_smoothed_gradient():
@@ -111,7 +112,7 @@ def test_pytrees_with_a_sigma_for_each_leaf_and_ad_where_there_is_none_within_bo
         assert record.y["c"][1] <= 2.5
 
 
-def test_the_average_wins_where_noise_makes_the_iterates_wander():
+def test_the_average_wanders_less_than_noise_makes_the_iterates():
     def noisy(y, key):
         bits = jax.lax.bitcast_convert_type(y, jnp.uint32)
         return y**2 + jax.random.normal(jax.random.fold_in(key, bits))
@@ -121,15 +122,13 @@ def test_the_average_wins_where_noise_makes_the_iterates_wander():
 
     def final(seed):
         key = jax.random.key(seed)
-        solution = run(noisy, solver, 0.0, key, key=jax.random.key(500 + seed))
-        return solution.value, solution.state.average
+        return run(noisy, solver, 0.0, key, key=jax.random.key(500 + seed)).state.average
 
-    value, average = jax.jit(jax.vmap(final))(seeds)
+    average = jax.jit(jax.vmap(final))(seeds)
     # sgd with step a on y^2 and gradient noise s^2 = (1 + ...) / (16 * 0.5^2) wanders with variance
     # a s^2 / (4 (1 - a)), of which the average over ten steps keeps about a third
     wander = 0.2 * (1 / (16 * 0.25)) / (4 * 0.8)
     assert np.mean(average**2) < 0.6 * wander
-    assert np.mean(value**2) < 0.9 * wander
 
 
 # how it runs
@@ -206,9 +205,10 @@ def test_a_failed_step_keeps_the_iterate_and_says_so():
     solution = run(fun, sd.FirstOrder(optax.sgd(30.0), 0.1), jnp.ones(2))
     assert solution.result == NONFINITE
     assert solution.stats["num_steps"] == 2
-    # the start is the only candidate with a finite estimate
-    np.testing.assert_array_equal(solution.value, jnp.ones(2))
+    # the best of those of the first batch
+    np.testing.assert_allclose(solution.value, jnp.ones(2), atol=0.4)
     assert solution.stats["fun"] == pytest.approx(0.4**2 + 1.4**2, rel=0.5)
+    assert solution.stats["fun"] < 0.4**2 + 1.4**2
 
 
 # bad input
@@ -255,25 +255,19 @@ def test_what_is_no_optax_transformation_is_refused():
 # the shared parts
 
 
-def test_judge_takes_the_lowest_finite_and_the_first_of_equals():
-    estimate = lambda y: (jnp.sqrt(y["a"]), y["a"])
-    judged = lambda *values: judge(estimate, *({"a": jnp.float32(v)} for v in values))
-    y, fun, stderr = judged(4.0, -1.0, 1.0)
-    assert (y["a"], fun, stderr) == (1.0, 1.0, 1.0)
-    assert judged(-1.0, -2.0)[0]["a"] == -1.0
-    tags = {"a": jnp.zeros(()), "tag": jnp.asarray(1)}, {"a": jnp.zeros(()), "tag": jnp.asarray(2)}
-    assert judge(estimate, *tags)[0]["tag"] == 1
-
-
-def test_progress_records_the_best_of_the_finite_steps():
+def test_progress_records_the_best_of_the_finite_steps_and_the_lowest_of_all():
     progress = Progress.start(jnp.zeros(1), jnp.float32)
-    for i, (fun, finite) in enumerate([(3.0, True), (1.0, False), (2.0, True), (2.5, True)]):
+    assert (progress.lowest_y, progress.lowest_fun, progress.start_y) == (0, np.inf, 0)
+    steps = [(3.0, True, 9.0), (1.0, False, 4.0), (2.0, True, 5.0), (2.5, True, np.inf)]
+    for i, (fun, finite, value) in enumerate(steps):
         values = jnp.float32(fun), jnp.float32(0.1 * i), {"a": 0.5, "b": jnp.array([0.1, 0.7])}
-        progress = progress.after(jnp.full(1, i), *values, 10, jnp.asarray(finite))
+        seen = Seen(jnp.full(1, 10.0 * i), jnp.float32(value))
+        progress = progress.after(jnp.full(1, i), *values, 10, jnp.asarray(finite), seen)
     assert (progress.step, progress.evaluations) == (4, 40)
     assert (progress.fun, progress.sigma) == (2.5, jnp.float32(0.7))
     assert (progress.best_y, progress.best_fun) == (2, 2.0)
     assert progress.best_stderr == jnp.float32(0.2)
+    assert (progress.lowest_y, progress.lowest_fun, progress.start_y) == (10, 4.0, 0)
 
 
 def test_project_takes_numbers_pytrees_and_open_sides():

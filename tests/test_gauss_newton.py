@@ -71,9 +71,9 @@ def waves(y, given):
 
 
 def wall(y, beyond):
-    """A valley at 20, and anything beyond 30."""
-    rows = padded(jnp.stack([20 - y[0], y[1], jnp.ones_like(y[0])]))
-    return jnp.where(y[0] > 30, beyond[0], rows)
+    """A curve to a valley at 20, so that steps go too far, and anything beyond 20.5."""
+    rows = padded(jnp.stack([20 - y[0] ** 2 / 20, y[1], jnp.ones_like(y[0])]))
+    return jnp.where(y[0] > 20.5, beyond[0], rows)
 
 
 def hole(y, given):
@@ -228,17 +228,19 @@ def test_bounds_give_the_constrained_solution(bound, x64):
     assert np.all((seen >= low) & (seen <= high))
 
 
-def test_plateaus_lead_to_their_middle(dtype):
+def test_steps_are_climbed_down_to_the_last(dtype):
     target = (14, 20)
     result = solve(bars, (8, 25), target, sigma=3.0, dtype=dtype, bounds=far_bounds(dtype))
     assert squares(bars, result.y, target, dtype=dtype) == 0
-    np.testing.assert_allclose(result.y, target, atol=0.1)
 
 
-def test_one_plateau_everywhere_widens_sigma_and_is_looked_at_with_all_samples():
-    result = solve(table, (0, 0), sigma=1.0, max_evaluations=12 + 24)
-    assert [record.sigma for record in result.history] == pytest.approx([1, 2, 4, 8])
-    assert [record.evaluations for record in result.history] == [6, 12, 18, 24]
+def test_one_plateau_everywhere_widens_sigma_until_it_is_left():
+    """A wall of height one around the start, 50 away on all sides."""
+    result = solve(table, (0, 0), sigma=1.0, max_evaluations=80)
+    sigmas = [record.sigma for record in result.history]
+    assert sigmas[:3] == [1.0] * 3
+    assert max(sigmas) >= 32
+    assert result.fun == 0
 
 
 def test_runs_of_optimistix_on_pytrees_inside_jit_are_those_on_vectors(x64):
@@ -260,8 +262,8 @@ def test_runs_of_optimistix_on_pytrees_inside_jit_are_those_on_vectors(x64):
     result = solve(line, y0, sigma=0.2, dtype=np.float64, bounds=bounds, max_steps=steps)
     assert jax.tree.structure(y) == jax.tree.structure(as_tree(y0))
     np.testing.assert_allclose(np.append(y["a"], y["b"][0]), result.y, rtol=1e-6)
-    assert stats["evaluations"] == result.evaluations == 6 + 2 * (steps - 1) + 2 * 6
-    for name in ("fun", "stderr"):
+    assert stats["evaluations"] == result.evaluations == steps + 1
+    for name in ("fun", "smoothed", "stderr"):
         np.testing.assert_allclose(stats[name], getattr(result, name), rtol=1e-6)
 
 
@@ -272,66 +274,68 @@ def test_iterates_are_those_of_optimistix_to_the_last_bit(precision, restarts):
         fun, y0, args = problem(bars, (2, 29), (14, 20), precision)
         solver = sd.GaussNewton(jnp.asarray(3.0, precision), **SEARCHES if restarts else {})
         bounds = sides((0, 31), precision)
-        options, steps = {"key": KEY, "bounds": bounds}, 40 if restarts else 8
+        options, steps = {"key": KEY, "bounds": bounds}, 40
         solution = optx.least_squares(fun, solver, y0, args, options, max_steps=steps, throw=False)
         result = sd.least_squares(
             fun, y0, args, key=KEY, solver=solver, bounds=bounds, max_steps=steps
         )
         np.testing.assert_array_equal(result.y, solution.value)
-        for name in ("fun", "stderr", "evaluations"):
-            assert getattr(result, name) == solution.stats[name]
-        begun = 1 + len(starts(result, (2, 29)))
-        assert (begun > 1) == restarts
-        # a first batch of six for each search, steps of two but where all are the same, and the two
-        # candidates judged
-        at_least = 6 * begun + 2 * (steps - begun) + 2 * 6
-        assert result.evaluations == at_least if not restarts else result.evaluations >= at_least
+        for name in ("fun", "smoothed", "stderr", "evaluations"):
+            np.testing.assert_array_equal(getattr(result, name), solution.stats[name])
+        # one a step, and the best point once more
+        assert result.evaluations == steps + 1
 
 
 def test_defaults_grow_with_the_parameters():
     few, many, very_many = (
         sd.GaussNewton(1.0).evaluations_per_step(jnp.zeros(n)) for n in (2, 100, 10**5)
     )
-    assert (few, many, very_many) == (6, 50, 96)
+    assert (few, many, very_many) == (1, 50, 96)
 
 
-def test_what_is_reported_was_evaluated():
-    """Fewer once samples differ."""
-    result = solve(bowl, (0, 0), watched=True, max_evaluations=12 + 6 + 11)
-    assert len(EVALUATED) == result.evaluations
-    took = np.diff([0, *(record.evaluations for record in result.history)])
-    assert took.tolist() == [6, 2, 2, 2]
+@pytest.mark.parametrize("num_samples", [None, 4])
+def test_what_is_reported_was_evaluated(num_samples):
+    run = solve(bowl, (0, 0), num_samples=num_samples, watched=True, max_evaluations=33)
+    assert len(EVALUATED) == run.evaluations
+    took = np.diff([0, *(record.evaluations for record in run.history)])
+    assert np.all(took == (num_samples or 1))
+    for record in run.history:
+        known = EVALUATED[: record.evaluations]
+        assert any(np.array_equal(record.y, y) for y in known)
+        assert record.fun == pytest.approx(min(squares(bowl, y) for y in known))
 
 
-def test_a_step_is_tried_five_times_as_far_and_a_better_point_is_gone_on_from():
-    run = solve(waves, (0, 1), sigma=1.0, watched=True, max_steps=8)
-    ys = [np.array([0, 1], np.float32), *(record.y for record in run.history)]
-    ends = [0, *(record.evaluations for record in run.history)]
-    further, gone_on = 0, 0
-    for i in range(1, len(run.history)):
-        batch, sigma = np.array(EVALUATED[ends[i] : ends[i + 1]]), run.history[i].sigma
-        np.testing.assert_array_equal(batch[0], ys[i])
-        step = 5 * (ys[i] - ys[i - 1])
-        if np.mean((step / sigma) ** 2) > 1:
-            further += 1
-            np.testing.assert_allclose(batch[1], ys[i] + step, rtol=1e-5)
-            # it is no sample of the smoothed function, so that only the iterate tells of that
-            assert run.history[i].fun == pytest.approx(squares(waves, ys[i]), rel=1e-5)
-            assert np.isnan(run.history[i].stderr)
-        # the next step is from the best point so far, if that is clearly better than the iterate
-        values = [squares(waves, y) for y in EVALUATED[: ends[i + 1]]]
-        better = min(values) < 0.8 * squares(waves, ys[i])
-        best = EVALUATED[int(np.argmin(values))] if better else ys[i]
-        gone_on += better
-        assert np.max(np.abs(ys[i + 1] - best)) <= 2.0 * sigma * (1 + 1e-5)
-    assert further >= 3
-    assert gone_on >= 2
+def test_a_linear_problem_takes_as_many_evaluations_as_its_model():
+    """The start, one for each parameter, and the solution, which is judged once."""
+    run = solve(bowl, (0.5, 0.7), sigma=0.6, max_steps=4)
+    assert run.fun < 1e-10
+    assert run.evaluations == 4 + 1
+
+
+def test_bounds_turn_the_first_points_inwards():
+    solve(bowl, (1, -2), sigma=1.0, bounds=(-2, 1), watched=True, max_steps=4)
+    np.testing.assert_array_equal(EVALUATED[:3], [[1, -2], [0, -2], [1, -1]])
+
+
+def test_a_step_that_fails_shrinks_the_radius_and_leaves_the_iterate():
+    """On a slope with waves steps fail often; the iterate is the lowest so far all the same."""
+    run = solve(waves, (0, 1), sigma=1.0, max_steps=60)
+    found = [squares(waves, record.y) for record in run.history]
+    local = [i for i in range(3, 60) if run.history[i].sigma < 1]
+    assert local
+    assert min(found) < 0.7 * found[0]
+
+
+def test_the_residuals_of_a_jump_are_left_by_wide_rounds():
+    """Jumps down to the valley: a local model sees one plateau after the other."""
+    run = solve(bars, (3, 26), (14, 20), sigma=3.0, bounds=(0, 39), max_evaluations=300)
+    assert squares(bars, run.y, (14, 20)) == 0
 
 
 @pytest.mark.parametrize("beyond", [np.nan, np.inf, 1e22])
-def test_what_is_tried_further_on_may_be_anything(beyond):
-    result = solve(wall, (0, 0), [beyond], sigma=0.5, watched=True, max_evaluations=80)
-    assert np.max(EVALUATED) > 30
+def test_the_end_of_a_step_may_be_anything(beyond):
+    result = solve(wall, (6, 1), [beyond], sigma=1.0, watched=True, max_evaluations=26)
+    assert np.max(EVALUATED) > 20.5
     assert result.reason == "max_evaluations"
     np.testing.assert_allclose(result.y, [20, 0], atol=0.05)
 
@@ -379,31 +383,34 @@ def test_a_schedule_is_taken_as_it_is():
 # several searches
 
 
-def starts(result, y0):
-    """After which of the steps, from 0, another search began."""
-    y0 = np.asarray(y0, np.float32)
-    return [i for i, record in enumerate(result.history[:-1]) if np.array_equal(record.y, y0)]
+def begun(sigma):
+    """Which evaluations, from 0, were the first of a search: the next two are sigma away."""
+    points = np.array(EVALUATED, float)
+    away = np.stack([points[i + 1 : i + 3] - points[i] for i in range(len(points) - 2)])
+    return np.flatnonzero(np.all(np.abs(np.abs(away) - sigma * np.eye(2)) < 1e-4, axis=(1, 2)))
 
 
-def test_a_restart_begins_at_the_start_with_the_first_sigma():
-    run = solve(table, (8, 25), sigma=3.0, bounds=(0, 39), max_steps=70, **SEARCHES)
-    begun = starts(run, (8, 25))
-    assert len(begun) == SEARCHES["restarts"]
-    for i in begun:
-        assert run.history[i + 1].sigma == 3.0
-        assert not np.array_equal(run.history[i + 1].y, run.history[0].y)
+def test_a_restart_begins_elsewhere_within_the_bounds_with_the_first_sigma():
+    bounds = (0, 39)
+    run = solve(table, (8, 25), sigma=3.0, bounds=bounds, watched=True, max_steps=150, **SEARCHES)
+    first = begun(3.0)
+    assert first[0] == 0
+    assert len(first) == 1 + SEARCHES["restarts"]
+    # patience counts evaluations
+    np.testing.assert_allclose(np.diff(first), SEARCHES["patience"], atol=1)
+    places = np.array(EVALUATED)[first]
+    assert len(np.unique(places, axis=0)) == len(places)
+    assert np.all((places >= bounds[0]) & (places <= bounds[1]))
     # the last search goes on, as the only one would
     assert run.reason == "max_steps"
-    assert begun[-1] + 3 * SEARCHES["patience"] < 70
 
 
 def test_a_run_resumed_in_a_later_search_ends_with_the_same_bits(tmp_path):
-    run = partial(solve, bars, (8, 25), (14, 20), sigma=3.0, bounds=(0, 39), **SEARCHES)
+    run = partial(solve, bars, (8, 25), (14, 20), sigma=3.0, bounds=(0, 39), watched=True)
+    run = partial(run, **SEARCHES | {"patience": 15})
     path, whole = tmp_path / "run.npz", run(max_steps=60)
-    begun = starts(whole, (8, 25))
-    between = begun[0] + 3
-    assert between < begun[1] < 60
-    assert squares(bars, whole.y, (14, 20)) == 0
+    between = int(begun(3.0)[1]) + 2
+    assert between < 60
     run(max_steps=between, checkpoint=path)
     resumed = run(max_steps=60, checkpoint=path)
     np.testing.assert_array_equal(resumed.y, whole.y)
@@ -414,24 +421,11 @@ def test_a_run_resumed_in_a_later_search_ends_with_the_same_bits(tmp_path):
 
 
 def test_a_search_that_converged_is_followed_by_the_next():
-    run = solve(decay, (1, 1), bounds=(-100, 100), max_steps=500, **SEARCHES)
+    settings = SEARCHES | {"restarts": 2, "patience": 100}
+    run = solve(decay, (1, 1), bounds=(-100, 100), max_steps=500, watched=True, **settings)
     assert run.reason == "converged"
     np.testing.assert_allclose(run.y, [2, 3], atol=0.02)
-    begun = starts(run, (1, 1))
-    assert len(begun) == SEARCHES["restarts"]
-    # a search ends with the third step in a row that is small, together with its sigma
-    begin = 0
-    for last in [*begun, len(run.history) - 1]:
-        search = run.history[begin : last + 1]
-        y = [np.array([1, 1], np.float32), *(record.y for record in search)]
-        tolerance = [0.01 + 0.01 * np.max(np.abs(before)) for before in y[:-1]]
-        steps = [np.max(np.abs(b - a)) for a, b in itertools.pairwise(y)]
-        if last in begun:
-            steps[-1] = 0  # where it led is not known, since y is the start again
-        small = [s + r.sigma < t for s, r, t in zip(steps, search, tolerance, strict=True)]
-        assert all(small[-3:])
-        assert not any(all(small[i : i + 3]) for i in range(len(small) - 3))
-        begin = last + 1
+    assert len(begun(0.3)) == 1 + 2
 
 
 def test_restarts_find_the_deeper_of_two_valleys():
@@ -447,13 +441,12 @@ def test_restarts_find_the_deeper_of_two_valleys():
             sigma=3.0,
             key=key,
             bounds=(0, 39),
-            max_steps=400,
+            max_steps=800,
             callback=at_target,
-            **SEARCHES,
+            restarts=20,
+            patience=30,
         )
         found.append(run.reason == "callback")
-        # the first search did not
-        assert starts(run, y0)
     assert all(found), found
 
 
@@ -463,7 +456,7 @@ def test_restarts_find_the_deepest_of_several_valleys():
     found = []
     for key in jax.random.split(KEY, 6):
         run = partial(solve, places, y0, target, sigma=3.0, key=key, bounds=(0, 39))
-        one, all_of_them = run(max_steps=60), run(restarts=20, max_steps=600)
+        one, all_of_them = run(max_steps=60), run(restarts=20, max_steps=1200)
         found.append([np.allclose(result.y, target, atol=1) for result in (one, all_of_them)])
         # nothing is different until the first search leads nowhere
         for a, b in zip(one.history[:30], all_of_them.history, strict=False):
@@ -530,7 +523,7 @@ def test_steps_that_make_it_worse_are_not_taken():
     """There is noise in no direction: the sum of squares never rises."""
     result = solve(valley, np.full(N, -0.5), sigma=0.1, max_steps=12, watched=True, **FEW)
     # what is reported was evaluated: the steps that are tried, too
-    assert len(EVALUATED) == result.evaluations == (12 + 2) * 48
+    assert len(EVALUATED) == result.evaluations == 12 * 48 + 2 + 48
     found = [squares(valley, record.y) for record in result.history]
     assert all(after <= before for before, after in itertools.pairwise(found))
     assert found[-1] < 0.5 * found[0]
@@ -544,7 +537,7 @@ def test_where_all_steps_make_it_worse_none_is_taken():
 
 def test_many_parameters_restart():
     run = solve(rounded, np.zeros(N), SOUGHT, sigma=0.5, max_steps=40, **FEW)
-    assert len(starts(run, np.zeros(N))) == 2
+    assert sum(not np.any(record.y) for record in run.history[:-1]) == 2
     assert run.fun < 0.1 * run.history[0].fun
 
 
@@ -578,7 +571,7 @@ def test_a_few_directions_of_5000_parameters_are_enough():
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: sd.GaussNewton(0.1, num_samples=2),
+        lambda: sd.GaussNewton(0.1, num_samples=0),
         lambda: sd.GaussNewton(0.1, num_samples=8, history=4),
         lambda: sd.GaussNewton(0.1, restarts=-1),
         lambda: sd.GaussNewton(0.1, patience=0),

@@ -15,7 +15,9 @@ N = 8
 ADAM = sd.FirstOrder(optax.adam(0.05), 0.2, num_samples=N)
 SCHEDULE = optax.linear_schedule(0.3, 0.1, 100)
 ANNEALED = sd.FirstOrder(optax.adam(0.05), SCHEDULE, num_samples=N)
-JUDGING = ADAM.final_evaluations(None)
+# without noise the lowest again, four candidates and a batch; set aside are three times as many
+JUDGING = 5 + N
+RESERVED = ADAM.final_evaluations(None)
 KEY = jax.random.key(5)
 Y0 = jnp.zeros(2)
 TARGET = jnp.array([0.6, -0.4])
@@ -34,13 +36,16 @@ class Host:
 
     def __init__(self):
         self.count, self.at, self.error = 0, 0, BaseException()
+        self.points, self.values = [], []
         self.box = sd.black_box(self.call, jax.ShapeDtypeStruct((), jnp.float32))
 
     def call(self, y):
         self.count += 1
         if self.count == self.at:
             raise self.error
-        return np.sum(np.floor(8 * np.abs(y - np.asarray(TARGET))))
+        self.points.append(np.array(y))
+        self.values.append(np.sum(np.floor(8 * np.abs(y - np.asarray(TARGET)))))
+        return self.values[-1]
 
 
 HOST = Host()
@@ -57,7 +62,7 @@ NO_EDGE = jnp.asarray(np.inf)
 @pytest.fixture
 def host():
     """The one black box of this file, so that it is compiled once; made new for each test."""
-    HOST.count, HOST.at = 0, 0
+    HOST.count, HOST.at, HOST.points, HOST.values = 0, 0, [], []
     return HOST
 
 
@@ -75,7 +80,7 @@ def stop_at(step, error: type[BaseException] = StopHereError):
 
 def assert_same(one, other):
     """Two results agree to the last bit, but for the seconds."""
-    pick = lambda r: (r.fun, r.stderr, r.evaluations, r.reason)
+    pick = lambda r: (r.fun, r.smoothed, r.stderr, r.evaluations, r.reason)
     assert pick(one) == pick(other)
     np.testing.assert_array_equal(one.y, other.y)
     assert len(one.history) == len(other.history)
@@ -111,7 +116,7 @@ def test_iterates_are_those_of_optimistix(dtype, to_the_last_bit):
     assert result.y.dtype == dtype
     rtol = 0 if to_the_last_bit else 1e-4
     np.testing.assert_allclose(result.y, solution.value, rtol=rtol)
-    for name in ("fun", "stderr", "evaluations"):
+    for name in ("fun", "smoothed", "stderr", "evaluations"):
         np.testing.assert_allclose(getattr(result, name), solution.stats[name], rtol=rtol)
     assert result.evaluations == 40 * N + JUDGING
     np.testing.assert_allclose(result.history[-1].fun, solution.state.progress.fun, rtol=rtol)
@@ -156,18 +161,18 @@ def test_history_says_what_happened():
 # the budget
 
 
-@pytest.mark.parametrize("budget", [N + JUDGING, 2 * N + JUDGING - 1, 100])
+@pytest.mark.parametrize("budget", [N + RESERVED, 2 * N + RESERVED - 1, 100])
 def test_max_evaluations_is_never_exceeded(budget, host):
     result = sd.minimise(host_plateaus, Y0, NO_EDGE, key=KEY, solver=ADAM, max_evaluations=budget)
     assert result.reason == "max_evaluations"
-    assert budget - N < host.count <= budget
+    assert budget - N < host.count + RESERVED - JUDGING <= budget
     assert result.evaluations == host.count
     assert result.history[-1].evaluations == host.count - JUDGING
 
 
 def test_a_budget_without_room_for_a_step_is_refused():
-    with pytest.raises(ValueError, match=rf"Allow {N + JUDGING}"):
-        sd.minimise(waves, Y0, TARGET, key=KEY, solver=ADAM, max_evaluations=N + JUDGING - 1)
+    with pytest.raises(ValueError, match=rf"Allow {N + RESERVED}"):
+        sd.minimise(waves, Y0, TARGET, key=KEY, solver=ADAM, max_evaluations=N + RESERVED - 1)
 
 
 def test_steps_are_limited_by_what_is_given():
@@ -175,12 +180,12 @@ def test_steps_are_limited_by_what_is_given():
     default = run()
     assert (len(default.history), default.reason) == (256, "max_steps")
     np.testing.assert_allclose(default.y, TARGET, atol=0.06)
-    assert len(run(max_evaluations=300 * N + JUDGING).history) == 300
+    assert len(run(max_evaluations=300 * N + RESERVED).history) == 300
     assert len(run(max_evaluations=10_000, max_steps=3).history) == 3
     none = run(max_steps=0)
     assert none.history == []
     assert none.evaluations == JUDGING
-    np.testing.assert_array_equal(none.y, Y0)
+    assert none.fun == plateaus(none.y, TARGET) <= plateaus(Y0, TARGET)
 
 
 def test_the_callback_can_stop_the_run():
@@ -200,30 +205,27 @@ def test_a_solver_that_converges_stops():
 
 
 def test_the_result_is_judged_on_fresh_samples_not_on_luck():
-    level, sigma, steps = 10.0, 1.0, 100
-    noise = level / np.sqrt(N)
+    level, steps, seeds = 10.0, 100, 100
+    random = np.random.default_rng(0)
 
-    def noisy(y, key):
-        bits = jax.lax.bitcast_convert_type(y, jnp.uint32)
-        return y**2 + level * jax.random.normal(jax.random.fold_in(key, bits))
+    def noisy(y, args):
+        noise = lambda y: level * random.normal(size=y.shape).astype(np.float32)
+        return y**2 + jax.pure_callback(noise, y, y, vmap_method="expand_dims")
 
-    smoothed = lambda y: y**2 + sigma**2
-    solver = sd.FirstOrder(optax.sgd(0.02), sigma, num_samples=N)
+    solver = sd.FirstOrder(optax.sgd(0.02), 1.0, num_samples=N)
 
     def run(seed):
-        key, options = jax.random.key(seed), {"key": jax.random.key(1000 + seed)}
-        solution = optx.minimise(noisy, solver, 3.0, key, options, max_steps=steps, throw=False)
+        options = {"key": jax.random.key(seed)}
+        solution = optx.minimise(noisy, solver, 3.0, None, options, max_steps=steps, throw=False)
         lucky = solution.state.progress
-        return solution.value, solution.stats["fun"], lucky.best_y, lucky.best_fun
+        return solution.value, solution.stats["fun"], lucky.lowest_y, lucky.lowest_fun
 
-    seeds = 100
     y, fun, lucky_y, lucky_fun = jax.jit(jax.vmap(run))(jnp.arange(seeds))
-    # the lowest of 100 estimates flatters by about two standard errors, that of 3 by less than one
-    flattery = lambda fun, y: np.mean(np.asarray(smoothed(y) - fun)) / noise
-    assert flattery(lucky_fun, lucky_y) > 1.5
-    assert flattery(fun, y) < 1
-    gain = np.asarray(smoothed(lucky_y) - smoothed(y))
-    assert np.mean(gain) > 3 * np.std(gain) / np.sqrt(seeds)
+    # the lowest of 800 values flatters by three times the noise; the lowest of five means of three
+    # by 1.2 times their noise
+    flattery = lambda fun, y: np.mean(np.asarray(y**2 - fun)) / level
+    assert flattery(lucky_fun, lucky_y) > 2.5
+    assert flattery(fun, y) < 1.2 / np.sqrt(3)
 
 
 # interruptions and faults
@@ -235,10 +237,9 @@ def test_ctrl_c_in_the_callback_returns_what_has_been_found(host):
     )
     assert (result.reason, len(result.history)) == ("interrupted", 6)
     assert result.evaluations == host.count == 6 * N
-    best = min(result.history, key=lambda r: r.fun)
-    assert (result.fun, result.stderr) == (best.fun, best.stderr)
-    starts = [np.asarray(Y0)] + [r.y for r in result.history]
-    np.testing.assert_array_equal(result.y, starts[best.step - 1])
+    assert result.fun == min(host.values) == host.call(result.y)
+    assert any(np.array_equal(result.y, y) for y in host.points[: 6 * N])
+    assert np.isnan([result.smoothed, result.stderr]).all()
 
 
 @pytest.mark.parametrize("at", [3, 6 * N + 3])
@@ -274,7 +275,8 @@ def test_a_step_that_is_not_finite_raises_and_keeps_the_result(host):
     assert caught.value.__cause__ is None
     found = caught.value.result
     assert found.reason == "nonfinite"
-    assert np.all(np.isfinite([*found.y, found.fun, found.stderr]))
+    allowed = [v for y, v in zip(host.points, host.values, strict=True) if y[0] <= edge]
+    assert found.fun == min(allowed)
     assert found.evaluations == host.count == (len(found.history) + 1) * N
     # it went on until about half of the samples failed, where the other stops at the first one
     assert 0.1 < found.history[-1].y[0] < 0.5

@@ -194,7 +194,7 @@ def test_a_constant_function_ends_as_noise(dtype):
     result = solve(constant, (1.0, 2.0), max_evaluations=1000, dtype=dtype)
     assert result.reason == "noise"
     assert len(result.history) == sd.NewtonCG(0.5).patience
-    assert (result.fun, result.stderr) == (3, 0)
+    assert (result.fun, result.smoothed, result.stderr) == (3, 3, 0)
     np.testing.assert_array_equal(flat(result.y), [1, 2])
     widths = [record.sigma for record in result.history]
     assert np.all(np.diff(widths) > 0)
@@ -206,7 +206,9 @@ def test_a_constant_function_ends_as_noise(dtype):
 def test_noise_of_1_and_10_percent_of_the_range(problem, noise, seeds):
     # from (2, 2) to the target the function falls by 8.5
     run = functools.partial(solve, problem, (2.0, 2.0), (0.5, -0.5))
-    away = [distance(run(seed=s, max_evaluations=400).y, (0.5, -0.5)) for s in range(seeds)]
+    # the search, and not the lowest of the values, which is luck
+    last = lambda seed: run(seed=seed, max_evaluations=400).history[-1].y
+    away = [distance(last(seed), (0.5, -0.5)) for seed in range(seeds)]
     # where the function has risen by a tenth of the noise, and by as much as the noise
     assert np.median(away) < np.sqrt(0.1 * noise)
     assert np.max(away) < 1.3 * np.sqrt(noise)
@@ -333,10 +335,10 @@ def test_iterates_are_those_of_optimistix_to_the_last_bit():
     solution = optx.minimise(plane, solver, y0, args, options, max_steps=30, throw=False)
     result = sd.minimise(plane, y0, args, key=KEY, solver=solver, max_steps=30)
     np.testing.assert_array_equal(result.y, solution.value)
-    for name in ("fun", "stderr", "evaluations"):
+    for name in ("fun", "smoothed", "stderr", "evaluations"):
         assert getattr(result, name) == solution.stats[name]
     assert solution.result == optx.RESULTS.nonlinear_max_steps_reached
-    assert result.evaluations == 30 * 6 + 3 * 6
+    assert result.evaluations == 30 * 6 + 5 + 6
 
 
 def test_runs_vmapped_on_vectors_are_single_ones_on_pytrees(x64):
@@ -353,8 +355,9 @@ def test_runs_vmapped_on_vectors_are_single_ones_on_pytrees(x64):
         run = solve(
             quadratic, (0.0, 0.0), target, sigma=1.0, seed=seed, max_steps=3, dtype=np.float64
         )
-        assert stats["evaluations"][seed] == run.evaluations == 3 * 6 + 3 * 6
+        assert stats["evaluations"][seed] == run.evaluations == 3 * 6 + 5 + 6
         assert stats["fun"][seed] == pytest.approx(run.fun, abs=1e-4)
+        assert stats["smoothed"][seed] == pytest.approx(run.smoothed, abs=1e-4)
         run.history.pop()  # the next step says what was accepted
         assert run.history[-1].y["b"][0].shape == (1,)
         np.testing.assert_allclose(accepted, flat(run.history[-1].y), atol=1e-5)
@@ -368,7 +371,7 @@ def test_a_resumed_run_ends_with_the_same_bits(tmp_path):
     np.testing.assert_array_equal(resumed.y, whole.y)
     pick = lambda record: (record.step, record.evaluations, record.fun, record.stderr, record.sigma)
     assert list(map(pick, resumed.history)) == list(map(pick, whole.history))
-    assert resumed.fun == whole.fun
+    assert (resumed.fun, resumed.smoothed) == (whole.fun, whole.smoothed)
 
 
 def bowl(y, args):

@@ -241,7 +241,7 @@ def test_crosses_plateaus_in_both_precisions(dtype):
     assert solution.value.dtype == solution.stats["fun"].dtype == dtype
     np.testing.assert_allclose(solution.value, TARGET, atol=0.1)
     assert solution.result == MAX_STEPS
-    assert solution.stats["evaluations"] == 300 * 2 + 2 * 2
+    assert solution.stats["evaluations"] == 300 * 2 + 4 + 2
     weights = jax.tree.leaves(solution.state.fit.weights)
     assert all(w.dtype == dtype for w in weights)
 
@@ -275,7 +275,7 @@ def test_every_configuration_descends(change, runs):
     solution = runs(BOWL)
     assert height(solution.value) < 0.1 * height(np.zeros(2))
     # what is done on the surrogate costs nothing
-    assert solution.stats["evaluations"] == 302 * change.get("num_samples", 2)
+    assert solution.stats["evaluations"] == 4 + 301 * change.get("num_samples", 2)
 
 
 def test_drop_leaves_failed_samples_out():
@@ -399,7 +399,8 @@ def test_iterates_are_those_of_minimise(dtype, to_the_last_bit, tmp_path):
     same = functools.partial(np.testing.assert_allclose, rtol=0 if to_the_last_bit else 1e-4)
     jax.tree.map(same, result.y, solution.value)
     same(result.fun, solution.stats["fun"])
-    assert result.evaluations == solution.stats["evaluations"] == 30 * 2 + 4
+    same(result.smoothed, solution.stats["smoothed"])
+    assert result.evaluations == solution.stats["evaluations"] == 30 * 2 + 4 + 2
     first = result.history[0]
     assert (first.step, first.evaluations) == (1, 2)
     assert np.isnan(first.stderr)

@@ -19,6 +19,7 @@ Wang, Distributed optimization of deeply nested systems, 2014).
 """
 
 import itertools
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -69,7 +70,7 @@ class Solvers:
     """
 
     def __init__(self, grey: Grey, answer: jax.Array):
-        samples = sd.GaussNewton(grey.sigma).evaluations_per_step(answer)
+        samples = 4 + int(3 * math.log(answer.size))
         self._grey, self._samples = grey, samples
         self._solver = sd.GaussNewton(grey.sigma, num_samples=samples, history=2 * samples)
         self._function = lambda x, picture: (grey.render(x) - picture, None)

@@ -14,9 +14,10 @@ iterates, one step at a time under `smoothdiff.minimise`. What both rely on:
   `finite` is False.
 * `terminate` depends on the state alone, and with `finite` False gives `RESULTS.nonfinite`;
   `reason(state)` says in a word why it asked to stop.
-* `postprocess` makes at most `final_evaluations(y)` evaluations, to judge its candidates on fresh
-  samples (`judge`). It returns the statistics `fun` and `stderr` of the winner, and `evaluations`,
-  those of the whole run.
+* `postprocess` makes at most `final_evaluations(y)` evaluations, to judge its candidates beside the
+  lowest point that was evaluated, for which the points of a step go to `Progress.after` (`judged`).
+  It returns the statistics `fun`, the function at the winner, `smoothed` and `stderr`, from a batch
+  around it, and `evaluations`, those of the whole run.
 """
 
 from smoothdiff._solvers._base import AbstractSmoothSolver, Progress

@@ -1,7 +1,6 @@
-"""What the solvers share: progress that a host loop can read, options, a last judgement."""
+"""What the solvers share: progress that a host loop can read, and options."""
 
 import abc
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -12,6 +11,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from smoothdiff._params import Params, as_key, take_apart
+from smoothdiff._seen import Seen
 
 # optax and norms mix dtypes (Adam raises a float to an integer), whatever the user's setting
 promotion = partial(jax.numpy_dtype_promotion, "standard")
@@ -21,8 +21,10 @@ class Progress(eqx.Module):
     """What a solver has done so far, in arrays only, as the field `progress` of its state.
 
     `fun`, `stderr` and `sigma` belong to the last batch, `best_*` to the lowest estimate so far:
-    lowest by luck as much as by merit, hence a candidate and no answer. `finite` turns False when
-    a step failed; the iterate is then the one from before that step.
+    lowest by luck as much as by merit, hence a candidate and no answer. `lowest_*` is the point of
+    all that were evaluated at which the function itself was lowest, and `start_y` where the run
+    began. `finite` turns False when a step failed; the iterate is then the one from before that
+    step.
     """
 
     step: Int[Array, ""]
@@ -34,6 +36,9 @@ class Progress(eqx.Module):
     best_y: PyTree[Array]
     best_fun: Float[Array, ""]
     best_stderr: Float[Array, ""]
+    lowest_y: PyTree[Array]
+    lowest_fun: Float[Array, ""]
+    start_y: PyTree[Array]
 
     @staticmethod
     def start(y: PyTree[Array], dtype: Any) -> "Progress":
@@ -41,7 +46,20 @@ class Progress(eqx.Module):
         unknown = jnp.asarray(jnp.inf, dtype)
         count = jnp.asarray(0, jnp.int32)
         good = jnp.asarray(True)
-        return Progress(count, count, unknown, unknown, unknown, good, y, unknown, unknown)
+        return Progress(
+            step=count,
+            evaluations=count,
+            fun=unknown,
+            stderr=unknown,
+            sigma=unknown,
+            finite=good,
+            best_y=y,
+            best_fun=unknown,
+            best_stderr=unknown,
+            lowest_y=y,
+            lowest_fun=unknown,
+            start_y=y,
+        )
 
     def after(
         self,
@@ -51,14 +69,22 @@ class Progress(eqx.Module):
         sigma: PyTree,
         evaluations: int | Int[Array, ""],
         finite: Bool[Array, ""],
+        seen: Seen,
     ) -> "Progress":
-        """The progress after one more step, whose batch estimated the function at `y`."""
+        """The progress after one more step, which estimated the function at `y`.
+
+        `seen` is the lowest of all that it evaluated, whether it failed or not.
+        """
         dtype = self.fun.dtype
         fun, stderr = fun.astype(dtype), stderr.astype(dtype)
         widths = [jnp.max(jnp.asarray(s)).astype(dtype) for s in jax.tree.leaves(sigma)]
         better = finite & (fun < self.best_fun)
         best = (y, fun, stderr), (self.best_y, self.best_fun, self.best_stderr)
         best_y, best_fun, best_stderr = jax.tree.map(lambda a, b: jnp.where(better, a, b), *best)
+        # of equals the last: on a plateau that is further from where the run came in
+        lower = jnp.isfinite(seen.value) & (seen.value <= self.lowest_fun)
+        there = (seen.point, seen.value.astype(dtype)), (self.lowest_y, self.lowest_fun)
+        lowest_y, lowest_fun = jax.tree.map(lambda a, b: jnp.where(lower, a, b), *there)
         return Progress(
             step=self.step + 1,
             evaluations=self.evaluations + evaluations,
@@ -69,6 +95,9 @@ class Progress(eqx.Module):
             best_y=best_y,
             best_fun=best_fun,
             best_stderr=best_stderr,
+            lowest_y=lowest_y,
+            lowest_fun=lowest_fun,
+            start_y=self.start_y,
         )
 
 
@@ -161,18 +190,3 @@ def dot(a: Array, b: Array) -> Array:
 def all_finite(tree: PyTree[Array]) -> Bool[Array, ""]:
     """Whether there is no NaN and no infinity in any leaf."""
     return jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]).all()
-
-
-def judge(
-    estimate: Callable[[PyTree[Array]], tuple[Array, Array]], *candidates: PyTree[Array]
-) -> tuple[PyTree[Array], Array, Array]:
-    """The candidate with the lowest fresh estimate, with that estimate and its standard error.
-
-    `estimate(y)` returns both, and sees the same random numbers for every candidate, so that they
-    cancel from the comparison. A candidate without a finite estimate loses; ties go to the first.
-    """
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *candidates)
-    funs: Array
-    funs, stderrs = jax.lax.map(estimate, stacked)
-    winner = jnp.argmin(jnp.where(jnp.isfinite(funs), funs, jnp.inf))
-    return jax.tree.map(lambda leaf: leaf[winner], stacked), funs[winner], stderrs[winner]

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from smoothdiff._draws import Draws
 from smoothdiff._params import Params
 from smoothdiff._samplers import AbstractSampler
+from smoothdiff._seen import Seen, kept, lowest
 
 
 class Residuals(eqx.Module):
@@ -71,9 +72,13 @@ class ResidualBatch(eqx.Module):
         first = self.rows[jnp.argmax(self.good)]
         return jnp.all(jnp.where(self.good[:, None], self.rows == first[None], True))
 
+    def lowest(self) -> tuple[Float[Array, " n"], Float[Array, ""]]:
+        """The point with the smallest sum of squares, and half of that."""
+        return lowest(self.points, jnp.where(self.good, half_squares(self.rows), jnp.inf))
+
     def loss(self) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """The mean of half the sum of squares over the good ones, and its standard error."""
-        values, used = jnp.sum(self.rows**2, axis=1) / 2, self.good & self.drawn
+        values, used = half_squares(self.rows), self.good & self.drawn
         # where all that were drawn are dropped, another point has to do
         used = jnp.where(jnp.any(used), used, self.good)
         count = jnp.sum(used).astype(values.dtype)
@@ -88,7 +93,8 @@ def around(
 ) -> Float[Array, "count n"]:
     """Points around the parameters, within the bounds."""
     draws = Draws(sampler, key, count, params.theta.size, params.theta.dtype, None)
-    return draws.map(lambda z, _: jax.vmap(params.clip)(params.theta[None] + sigma[None] * z))
+    place = lambda z, _: jax.vmap(params.clip)(params.theta[None] + sigma[None] * z)
+    return kept(draws.map(place))
 
 
 def centred(x: Float[Array, "m k"], valid: Bool[Array, " m"]) -> Float[Array, "m k"]:
@@ -111,11 +117,32 @@ def check_residuals(f_struct: PyTree) -> None:
             )
 
 
+def half_squares(rows: Float[Array, "m P"]) -> Float[Array, " m"]:
+    """What least squares minimises, of each row."""
+    return jnp.sum(rows**2, axis=1) / 2
+
+
+def loss_at(residuals: Residuals) -> Callable[[PyTree[Array]], Float[Array, " m"]]:
+    """Half the sum of squares as a function of stacked points."""
+
+    def values(points: PyTree[Array]) -> Array:
+        vector = residuals.params.layout.vector
+        rows, _ = residuals(jax.vmap(lambda y: vector(jax.tree.leaves(y)))(points))
+        return half_squares(rows)
+
+    return values
+
+
 def fresh_loss(
     residuals: Residuals, points: Float[Array, "m n"], nonfinite: str
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """The smoothed loss by these points and its standard error; NaN if too few are good."""
+) -> tuple[Float[Array, ""], Float[Array, ""], Seen]:
+    """The smoothed loss by these points, its standard error, and the lowest of the points.
+
+    The loss is NaN if too few are good.
+    """
     rows, _ = residuals(points)
     batch = ResidualBatch.of(points, rows, jnp.asarray(len(points)))
     fun, stderr = batch.loss()
-    return jnp.where(batch.enough(nonfinite), fun, jnp.nan), stderr
+    point, value = batch.lowest()
+    seen = Seen(residuals.params.layout.tree(point), value)
+    return jnp.where(batch.enough(nonfinite), fun, jnp.nan), stderr, seen

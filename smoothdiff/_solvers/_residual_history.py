@@ -31,13 +31,33 @@ class History(eqx.Module):
         valid: Bool[Array, " m"],
         count: Int[Array, ""],
     ) -> "History":
-        """With the first `count` of these rows in place of as many of the oldest."""
+        """With the first `count` of these rows in place of as many of the oldest, but the best."""
+        best = self._best()
+        place = jnp.where(best < count, count, best) % len(self.valid)
+        safe = jax.tree.map(lambda a: a.at[place].set(a[best]), self)
 
         def latest(old: Array, new: Array) -> Array:
             return jax.lax.dynamic_slice_in_dim(jnp.concatenate([old, new]), count, len(old))
 
         new = History(points, residuals, valid)
-        return jax.tree.map(latest, self, new)
+        return jax.tree.map(latest, safe, new)
+
+    def best(self, start: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " P"]]:
+        """The point with the smallest sum of squares, and its row; at first the start, and zeros.
+
+        Of equals the newest.
+        """
+        i = self._best()
+        known = jnp.any(self.valid)
+        return jnp.where(known, self.points[i], start), self.residuals[i]
+
+    def mostly_valid(self, count: int) -> Bool[Array, ""]:
+        """Whether at least half of the last so many are valid."""
+        return 2 * jnp.sum(self.valid[-count:]) >= count
+
+    def _best(self) -> Int[Array, ""]:
+        squares = jnp.where(self.valid, jnp.sum(self.residuals**2, axis=1), jnp.inf)
+        return len(squares) - 1 - jnp.argmin(squares[::-1])
 
     def lowest(
         self, point: Float[Array, " n"], row: Float[Array, " P"]

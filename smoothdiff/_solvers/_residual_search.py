@@ -1,101 +1,247 @@
-"""One search of Gauss-Newton, from a start to where it leads nowhere."""
+"""One search of Gauss-Newton with few parameters: first points, a trust region, wide regressions.
+
+The function is evaluated at the start and one sigma from it along each parameter. Then a model of
+the residuals around the best point says where to evaluate next, while it predicts what comes. Where
+its steps fail in a row, or most residuals do not move, a wide regression takes over: rounds of
+samples around a center, which may go uphill, until its steps come true.
+"""
+
+from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from smoothdiff._params import Params
 from smoothdiff._solvers._residual_history import History
+from smoothdiff._solvers._residual_trust import Proposal, TrustRegion
+from smoothdiff._solvers._wide_rounds import Wide, sides_of
 
-# sigma follows twice the standard error of the step, at most so much smaller or larger at a time
-_SHRINK, _GROW = 0.25, 1.5
-# ... and no wider than so many times what the user gave, unless all samples are the same
-_WIDEST = 2.0
-# a step is tried so many times as far, where that is at least sigma
-_FURTHER = 5.0
+# what is evaluated next
+FIRST, TRUST, WIDE = 0, 1, 2
+# evaluations of wide rounds since the last lower point, for each parameter, until the local model
+# is tried there, and its radius then, in widths
+_IDLE, _NARROWER = 6, 0.1
+# so many steps in a row that halve the loss, within the width, are trusted again
+_TRUE = 2
 # so many small steps in a row count as convergence
 _SMALL = 3
 
 
-class ResidualSearch(eqx.Module):
-    """Where a search stands.
+class Sizes(NamedTuple):
+    """Evaluations a step, and samples of a first wide round and of a later one."""
 
-    `scale` is the width relative to sigma, `seen` says that the last samples were not all the same.
-    `lowest` is the lowest estimate so far, `stale` counts the steps in a row that gave no lower
-    one, and `small` those that were small. `move` is the last step.
+    step: int
+    first: int
+    later: int
+
+
+class ResidualSearch(eqx.Module):
+    """Where a search stands: all that was evaluated, and what comes next.
+
+    `evaluated` counts the evaluations, `small` the small steps in a row, `stale` the evaluations
+    since the last lower point.
     """
 
-    scale: Float[Array, ""]
+    stage: Int[Array, ""]
     history: History
-    move: Float[Array, " n"]
-    seen: Bool[Array, ""]
-    lowest: Float[Array, ""]
-    stale: Int[Array, ""]
+    start: Float[Array, " n"]
+    evaluated: Int[Array, ""]
+    trust: TrustRegion
+    wide: Wide
     small: Int[Array, ""]
+    stale: Int[Array, ""]
 
     @staticmethod
-    def start(history: History) -> "ResidualSearch":
-        """Nothing is known but what is in the history, and samples are as wide as sigma."""
-        one, none = jnp.ones((), history.points.dtype), jnp.zeros((), jnp.int32)
-        still = jnp.zeros_like(history.points[0])
-        return ResidualSearch(one, history, still, jnp.asarray(False), jnp.inf * one, none, none)
-
-    def after(
-        self,
-        scale: Float[Array, ""],
-        history: History,
-        move: Float[Array, " n"],
-        seen: Bool[Array, ""],
-        fun: Float[Array, ""],
-        small: Bool[Array, ""],
-    ) -> "ResidualSearch":
-        """After a step with the estimate `fun`."""
+    def of(theta: Float[Array, " n"], history: History) -> "ResidualSearch":
+        """Nothing is known but what is in the history."""
+        n, size = len(theta), history.residuals.shape[1]
+        one, none = jnp.ones((), theta.dtype), jnp.zeros((), jnp.int32)
         return ResidualSearch(
-            scale,
-            history,
-            move,
-            seen,
-            jnp.minimum(self.lowest, fun),
-            jnp.where(fun < self.lowest, 0, self.stale + 1),
-            jnp.where(small, self.small + 1, 0),
+            stage=jnp.asarray(FIRST, jnp.int32),
+            history=history,
+            start=theta,
+            evaluated=none,
+            trust=TrustRegion.start(one, n, size),
+            wide=Wide.start(theta, jnp.zeros(size, theta.dtype), one),
+            small=none,
+            stale=none,
         )
 
-    def further(self, sigma: Float[Array, " n"]) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
-        """A step on in the direction of the last one, and whether it is worth an evaluation."""
-        step = _FURTHER * self.move
-        return step, jnp.mean((step / sigma) ** 2) > 1
+    def again(self, theta: Float[Array, " n"]) -> "ResidualSearch":
+        """Another search, from elsewhere, with other random numbers."""
+        empty = jax.tree.map(jnp.zeros_like, self.history)
+        anew = ResidualSearch.of(theta, empty)
+        return eqx.tree_at(lambda s: s.wide.rounds, anew, self.wide.rounds + 1)
+
+    def counted(self, small: Array, lower: Array, count: int) -> "ResidualSearch":
+        """With a small step more or less, and so many evaluations."""
+        small = jnp.where(small, self.small + 1, 0)
+        stale = jnp.where(lower, 0, self.stale + count)
+        counts = self.evaluated + count, small, stale
+        return eqx.tree_at(lambda s: (s.evaluated, s.small, s.stale), self, counts)
+
+    def enough(self, count: int) -> Bool[Array, ""]:
+        """Whether half of the last so many evaluations gave numbers, once there are so many."""
+        return (self.evaluated < count) | self.history.mostly_valid(count)
 
     def converged(self) -> Bool[Array, ""]:
         """Whether the last steps were small."""
         return self.small >= _SMALL
 
     def over(self, patience: int) -> Bool[Array, ""]:
-        """Whether it converged, or `patience` steps in a row gave no lower estimate."""
+        """Whether it converged, or so many evaluations in a row were no lower."""
         return self.converged() | (self.stale >= patience)
 
+    def is_local(self) -> Bool[Array, ""]:
+        """Whether a step within the trust region comes next."""
+        return self.stage == TRUST
 
-def next_scale(
-    scale: Float[Array, ""],
-    flat: Bool[Array, ""],
-    history: History,
-    here: Float[Array, " P"],
-    u: Float[Array, "M n"],
-    error: Float[Array, " n"],
-    length: Float[Array, ""],
-) -> Float[Array, ""]:
-    """How wide the next batch is, relative to sigma.
+    def width(self) -> Float[Array, ""]:
+        """How far from the iterate the function is looked at, relative to sigma."""
+        return jnp.where(self.stage == WIDE, self.wide.scale, self.trust.radius)
 
-    Args:
-        scale: That of this batch.
-        flat: The whole batch is the same; then the next one is twice as wide.
-        history: All samples, this batch included.
-        here: The residuals where the step starts, at the iterate or a better point.
-        u: The points of the history as seen from there.
-        error: The standard error of the step.
-        length: Of the step.
-    """
-    # a plateau of the residuals around the iterate is seen whole or not at all
-    plateau = history.valid & jnp.all(history.residuals == here[None], axis=1)
-    extent = jnp.max(jnp.where(plateau, jnp.sqrt(jnp.mean(u**2, axis=1)), 0))
-    wanted = jnp.maximum(2 * jnp.sqrt(jnp.mean(error**2)), length)
-    wanted = jnp.clip(jnp.maximum(wanted, extent), _SHRINK, _GROW)
-    return jnp.where(flat, 2 * scale, jnp.minimum(wanted * scale, _WIDEST))
+    def iterate(self) -> Float[Array, " n"]:
+        """The best point."""
+        return self.history.best(self.start)[0]
+
+    def propose(
+        self, params: Params, samples: Float[Array, "first n"], sizes: Sizes
+    ) -> tuple[Float[Array, "K n"], Proposal]:
+        """The next points to evaluate, not yet within the bounds, and what the model says of them.
+
+        `samples` are standard normal, and belong to the round.
+        """
+        sigma = params.sigma
+        count, size = sizes.step, self.history.residuals.shape[1]
+        n, dtype = len(sigma), samples.dtype
+        slot = jnp.arange(count, dtype=jnp.int32)
+        nothing = Proposal(
+            steps=jnp.zeros((count, n), dtype),
+            predicted=jnp.zeros((count, size), dtype),
+            promised=jnp.zeros(count, dtype),
+            slope=jnp.zeros(count, dtype),
+            jacobian=self.trust.jacobian,
+            poor=jnp.asarray(False),
+        )
+
+        def first() -> tuple[Array, Proposal]:
+            low, high = sides_of(params, self.start)
+            units = jnp.eye(n, dtype=dtype)
+            if low is not None and high is not None:
+                units = jnp.where(((high >= 1) | (high >= -low))[:, None], units, -units)
+            table = jnp.concatenate([jnp.zeros((1, n), dtype), units, samples])
+            at = jnp.minimum(self.evaluated + slot, len(table) - 1)
+            return self.start[None] + sigma[None] * table[at], nothing
+
+        def local() -> tuple[Array, Proposal]:
+            center, row = self.history.best(self.start)
+            sides = sides_of(params, center)
+            proposal = self.trust.propose(self.history, center, row, sigma, sides, count)
+            return center[None] + sigma[None] * proposal.steps, proposal
+
+        def wide() -> tuple[Array, Proposal]:
+            wide = self.wide
+            at = wide.taken + slot
+            width = sigma * wide.scale
+            points = (
+                wide.center[None] + width[None] * samples[jnp.clip(at - 1, 0, len(samples) - 1)]
+            )
+            step, worth = wide.further(width)
+            points = jnp.where(((at == 1) & worth)[:, None], (wide.center + step)[None], points)
+            return jnp.where((at == 0)[:, None], wide.center[None], points), nothing
+
+        return jax.lax.switch(self.stage, [first, local, wide])
+
+    def after(
+        self,
+        params: Params,
+        points: Float[Array, "K n"],
+        rows: Float[Array, "K P"],
+        good: Bool[Array, " K"],
+        proposal: Proposal,
+        sizes: Sizes,
+    ) -> "ResidualSearch":
+        """The search with these residuals at these points."""
+        kept = self.history.after(points, rows, good, jnp.asarray(sizes.step))
+        here = self.history.best(self.start)
+        with_rows = eqx.tree_at(lambda s: s.history, self, kept)
+        by_stage = [
+            lambda: with_rows._after_first(rows, good, sizes),
+            lambda: with_rows._after_local(here[1], rows, good, proposal),
+            lambda: with_rows._after_wide(params, rows, good, sizes),
+        ]
+        return jax.lax.switch(self.stage, by_stage)
+
+    def _to_wide(self, scale: Array) -> "ResidualSearch":
+        center, row = self.history.best(self.start)
+        wide = Wide.start(center, row, scale)
+        # the center is known: the samples begin at once
+        wide = eqx.tree_at(
+            lambda w: (w.taken, w.rounds), wide, (jnp.ones_like(wide.taken), self.wide.rounds + 1)
+        )
+        stage = jnp.full_like(self.stage, WIDE)
+        return eqx.tree_at(lambda s: (s.stage, s.wide), self, (stage, wide))
+
+    def _after_first(self, rows: Array, good: Array, sizes: Sizes) -> "ResidualSearch":
+        enough = self.evaluated + sizes.step > len(self.start)
+        stage = jnp.where(enough, TRUST, FIRST).astype(self.stage.dtype)
+        known = eqx.tree_at(lambda s: s.stage, self, stage)
+        _, row = self.history.best(self.start)
+        moved = jnp.any(self.history.residuals != row[None], axis=1) & self.history.valid
+        few = 2 * (1 + jnp.sum(moved)) <= jnp.sum(self.history.valid)
+        return _where(enough & few, known._to_wide(jnp.ones_like(self.wide.scale)), known)
+
+    def _after_local(
+        self, row: Array, rows: Array, good: Array, proposal: Proposal
+    ) -> "ResidualSearch":
+        trust = self.trust.revise(proposal, row, rows, good)
+        local = eqx.tree_at(lambda s: s.trust, self, trust)
+        scale = jnp.maximum(self.wide.scale, 1)
+        return _where(trust.failed(), local._to_wide(scale), local)
+
+    def _after_wide(
+        self, params: Params, rows: Array, good: Array, sizes: Sizes
+    ) -> "ResidualSearch":
+        wide, first = self.wide, self.wide.taken == 0
+        wanted = jnp.where(wide.seen, sizes.later, sizes.first)
+        fun = jnp.where(good[0], jnp.sum(rows[0] ** 2) / 2, jnp.inf)
+        _, lowest = self.history.best(self.start)
+        near = jnp.max(jnp.abs(wide.move / (params.sigma * wide.scale))) < 1
+        held = (fun < wide.before / 2) & (fun <= jnp.sum(lowest**2) / 2) & near
+        true = jnp.where(first, jnp.where(held, wide.true + 1, 0), wide.true)
+        before = jnp.where(first, fun, wide.before)
+        row = jnp.where(first, jnp.where(good[0], rows[0], jnp.inf), wide.row)
+        taken = wide.taken + sizes.step
+        newest = self.history.residuals[-sizes.step :]
+        lower = jnp.any(jnp.all(newest == lowest[None], axis=1) & good)
+        idle = jnp.where(lower, 0, wide.idle + sizes.step)
+        found = wide.found | lower
+        wide = eqx.tree_at(
+            lambda w: (w.true, w.before, w.row, w.taken, w.idle, w.found),
+            wide,
+            (true, before, row, taken, idle, found),
+        )
+        moved = lambda: wide.stepped(self.history, params, wanted)
+        search = eqx.tree_at(
+            lambda s: s.wide, self, jax.lax.cond(taken >= wanted, moved, lambda: wide)
+        )
+        tired = found & (idle >= _IDLE * (len(self.start) + 1))
+        radius = jnp.where(
+            true >= _TRUE,
+            2 * jnp.linalg.norm(wide.move / params.sigma),
+            _NARROWER * jnp.minimum(wide.scale, 1),
+        )
+        radius = jnp.maximum(jnp.asarray(radius), jnp.finfo(fun.dtype).eps)
+        trust = TrustRegion.start(
+            jnp.asarray(radius), len(self.start), self.history.residuals.shape[1]
+        )
+        back = eqx.tree_at(
+            lambda s: (s.stage, s.trust), self, (jnp.full_like(self.stage, TRUST), trust)
+        )
+        return _where((true >= _TRUE) | tired, back, search)
+
+
+def _where(condition: Array, a: ResidualSearch, b: ResidualSearch) -> ResidualSearch:
+    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)

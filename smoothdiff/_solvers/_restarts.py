@@ -37,9 +37,9 @@ class Restarts(eqx.Module):
         return going, Restarts(self.left - again.astype(self.left.dtype), self.theta, self.kernel)
 
 
-def check_restarts(patience: int, restarts: int) -> None:
+def check_restarts(patience: int | None, restarts: int) -> None:
     """The arguments that solvers with restarts have in common."""
-    if patience < 1:
+    if patience is not None and patience < 1:
         raise ValueError(f"patience must be 1 or more: {patience}")
     if restarts < 0:
         raise ValueError(f"restarts must be 0 or more: {restarts}")

@@ -14,12 +14,12 @@ from smoothdiff._baselines import AbstractBaseline
 from smoothdiff._named_baselines import as_baseline
 from smoothdiff._params import take_apart
 from smoothdiff._samplers import AbstractSampler, Gaussian
+from smoothdiff._seen import watched
 from smoothdiff._smooth import smooth
 from smoothdiff._solvers._base import (
     AbstractSmoothSolver,
     Progress,
     all_finite,
-    judge,
     project,
     promotion,
     read_options,
@@ -27,6 +27,7 @@ from smoothdiff._solvers._base import (
     stopped,
     unless_failed,
 )
+from smoothdiff._solvers._judgement import judged, judging, one_by_one
 
 # so many small updates in a row count as convergence: under noise a single one is luck
 _PATIENCE = 5
@@ -50,9 +51,9 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
        u_t = \text{optax}\left(\hat\nabla F_{\sigma_t}(y_t)\right), $$
 
     with $\Pi$ the projection onto the bounds, and one batch of `num_samples` evaluations a step for
-    the gradient, the value and its standard error. The point returned is the best of three by a
-    fresh batch each, all at the same random numbers: the last iterate, the running average of the
-    last ten or so (best where noise makes the iterates wander), and the one of lowest estimate.
+    the gradient, the value and its standard error. Candidates for the point returned, beside the
+    lowest that was evaluated: the last iterate, the running average of the last ten or so (best
+    where noise makes the iterates wander), the one of lowest estimate, and the start.
 
     Args:
         optim: an optax transformation, such as `optax.adam(0.1)`. It may ask for `value` and
@@ -134,11 +135,11 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
         return self.num_samples
 
     def final_evaluations(self, y: PyTree[Array]) -> int:
-        """A batch for each of the three candidates."""
-        return 3 * self.num_samples
+        """Those that judge the start, the last iterate, the average and the best estimate."""
+        return judging(self.num_samples, new=4)
 
     def _estimator(self, fn, args, step, options) -> Callable:
-        """`y -> value, (stderr, aux)`, differentiable, with the key and the sigma of a step."""
+        """`y -> value, (stderr, seen)`, differentiable, with the key and the sigma of a step."""
         key, bounds = read_options(options)
         sigma = sigma_at(self.sigma, step)
 
@@ -148,7 +149,7 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
             size = take_apart(y, sigma, bounds).theta.size
             spread = points > self.sampler.group(points, size)
             smoothed = smooth(
-                lambda y: fn(y, args),
+                watched(fn, args),
                 sigma,
                 num_samples=self.num_samples,
                 sampler=self.sampler,
@@ -160,8 +161,8 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
                 stderr=spread,
             )
             out = smoothed(jax.random.fold_in(key, step), y)
-            (fun, aux), stderr = out if spread else (out, jnp.full_like(out[0], jnp.nan))
-            return fun, (stderr, aux)
+            (fun, seen), stderr = out if spread else (out, jnp.full_like(out[0], jnp.nan))
+            return fun, (stderr, seen.lowest())
 
         return estimate
 
@@ -176,7 +177,7 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
         """One batch, one update."""
         progress = state.progress
         estimate = self._estimator(fn, args, progress.step, options)
-        (fun, (stderr, aux)), grad = jax.value_and_grad(estimate, has_aux=True)(y)
+        (fun, (stderr, seen)), grad = jax.value_and_grad(estimate, has_aux=True)(y)
         optim = optax.with_extra_args_support(self.optim)
         with promotion():
             updates, opt_state = optim.update(grad, state.opt_state, y, value=fun, grad=grad)
@@ -194,24 +195,26 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
             finite, (new_y, opt_state, average), (y, state.opt_state, state.average)
         )
         sigma = sigma_at(self.sigma, progress.step)
-        progress = progress.after(y, fun, stderr, sigma, self.num_samples, finite)
+        progress = progress.after(y, fun, stderr, sigma, self.num_samples, finite, seen)
         # the function was never evaluated at y itself, so its aux is that of a sample near y
-        aux = jax.tree.map(lambda a: a[0], aux)
-        return new_y, FirstOrderState(progress, opt_state, average, quiet), aux
+        return new_y, FirstOrderState(progress, opt_state, average, quiet), seen.aux
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """After small updates in a row, or a failed step."""
         return stopped(state.progress, state.quiet >= _PATIENCE)
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        """Judges the last iterate, the average and the best recorded on the next step's samples."""
+        """Judges all that was seen, the start, the last iterate, the average, the best estimate."""
         progress = state.progress
         estimate = self._estimator(fn, args, progress.step, options)
 
-        def judged(y):
-            fun, (stderr, _) = estimate(y)
-            return fun, stderr
+        def smoothed(y):
+            fun, (stderr, seen) = estimate(y)
+            return fun, stderr, seen
 
-        y, fun, stderr = judge(judged, y, state.average, progress.best_y)
-        evaluations = progress.evaluations + self.final_evaluations(y)
-        return y, aux, {"fun": fun, "stderr": stderr, "evaluations": evaluations}
+        values = one_by_one(fn, args, self.batch_size)
+        # the mean of points at a bound may be beyond it, by rounding
+        average = project(state.average, read_options(options)[1])
+        new = y, average, progress.best_y, progress.start_y
+        y, stats = judged(progress, values, smoothed, self.num_samples, new)
+        return y, aux, stats

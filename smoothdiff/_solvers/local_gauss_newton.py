@@ -10,17 +10,18 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from smoothdiff._samplers import AbstractSampler, Gaussian
+from smoothdiff._seen import Seen, kept
 from smoothdiff._solvers._base import (
     AbstractSmoothSolver,
     Progress,
     all_finite,
-    judge,
     promotion,
     read_options,
     smoothed_params,
     stopped,
     unless_failed,
 )
+from smoothdiff._solvers._judgement import judged, judging
 from smoothdiff._solvers._local_ensemble import (
     DAMPINGS,
     Blame,
@@ -34,6 +35,7 @@ from smoothdiff._solvers._residual_batch import (
     centred,
     check_residuals,
     fresh_loss,
+    loss_at,
 )
 from smoothdiff._support import AbstractSupport, as_support
 
@@ -74,8 +76,8 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     The step is tried with eight dampings $\lambda$, from 30 to 0.01. Then each parameter takes what
     was best in its own terms, which is tried too, and the best of all nine is the next iterate. So
     a step may be far from damped in one place and short in another. It is taken even where the
-    iterate was better, as a single point of a rough function is a matter of luck; the point of
-    lowest smoothed loss is kept, and judged at the end.
+    iterate was better, as a single point of a rough function is a matter of luck. What is returned
+    is the lowest that was evaluated, or with noise the best of a few by fresh evaluations.
 
     `GaussNewton` needs no support, but a time and a memory that grow with the number of parameters
     times that of residuals. Here M^2 numbers are kept for each term. It runs on CPUs and GPUs; on
@@ -174,8 +176,8 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         return self._samples(y) + _TRIED
 
     def final_evaluations(self, y: PyTree[Array]) -> int:
-        """A batch for each of the two candidates."""
-        return 2 * self._samples(y)
+        """Those that judge the start, and the last iterate and the best estimate again."""
+        return judging(self._samples(y), new=1, old=2)
 
     def _samples(self, y: PyTree[Array]) -> int:
         """Evaluations of a batch."""
@@ -215,14 +217,16 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         points = around(params, self.sampler, key, sigma, self._samples(y))
         rows, aux = residuals(points)
         batch = ResidualBatch.of(points, rows, jnp.asarray(len(points)))
-        theta, lowest = _next(residuals, blame, batch, sigma)
+        theta, at_end = _next(residuals, blame, batch, sigma)
 
         fun, stderr = batch.loss()
         scale = state.scale
         if not callable(self.sigma):
             # only a plateau makes it wider than the user's, and it does not jump back from there
             wider = jnp.where(scale < 1, jnp.minimum(_GROW * scale, 1), scale)
-            wanted = jnp.where(fun > _NOISE * lowest, _SHRINK * scale, wider)
+            # where no end is finite, the next samples are nearer
+            worse = ~jnp.isfinite(at_end) | (fun > _NOISE * at_end)
+            wanted = jnp.where(worse, _SHRINK * scale, wider)
             scale = jnp.where(batch.same(), 2 * scale, wanted)
         new_y = params.layout.tree(theta)
         with promotion():
@@ -230,7 +234,10 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             small = jnp.where(moved < self.atol + self.rtol * self.norm(y), state.small + 1, 0)
         finite = batch.enough(self.nonfinite) & all_finite((fun, theta, scale))
         new_y, scale = unless_failed(finite, (new_y, scale), (y, state.scale))
-        progress = progress.after(y, fun, stderr, sigma, len(points) + _TRIED, finite)
+        point, there = batch.lowest()
+        point, there = jnp.where(at_end < there, theta, point), jnp.minimum(there, at_end)
+        seen = Seen(params.layout.tree(point), there)
+        progress = progress.after(y, fun, stderr, sigma, len(points) + _TRIED, finite, seen)
         return new_y, LocalGaussNewtonState(progress, scale, small), aux
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
@@ -238,7 +245,7 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         return stopped(state.progress, state.small >= _SMALL)
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        """Judges the last iterate and the best recorded on the next step's samples."""
+        """Judges all that was seen and the start; with noise also the last and the best iterate."""
         progress = state.progress
         key = jax.random.fold_in(read_options(options)[0], progress.step)
 
@@ -249,9 +256,12 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             residuals = Residuals(fn, args, params, self.batch_size)
             return fresh_loss(residuals, points, self.nonfinite)
 
-        y, fun, stderr = judge(estimate, y, progress.best_y)
-        evaluations = progress.evaluations + self.final_evaluations(y)
-        return y, aux, {"fun": fun, "stderr": stderr, "evaluations": evaluations}
+        params = smoothed_params(self, y, progress.step, options)
+        values = loss_at(Residuals(fn, args, params, self.batch_size))
+        # every iterate but the start is an end that was evaluated
+        new, old = [progress.start_y], (y, progress.best_y)
+        y, stats = judged(progress, values, estimate, self._samples(y), new, old)
+        return y, aux, stats
 
 
 def _next(
@@ -259,7 +269,7 @@ def _next(
 ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     """The best of the ends of the steps that a batch suggests, and half the sum of squares there.
 
-    Where no end is finite, the iterate and zero, so that the next samples are nearer.
+    Where no end is finite, the iterate and infinity.
     """
     params = residuals.params
     terms = blame.terms(params.theta).size
@@ -270,13 +280,13 @@ def _next(
     mean = jnp.sum(batch.rows, axis=0) / count
 
     steps = ensemble_steps(blame, u, by_term(rows), by_term(mean[None])[0])
-    ends = jax.vmap(params.clip)(params.theta[None] + sigma[None] * steps)
+    ends = kept(jax.vmap(params.clip)(params.theta[None] + sigma[None] * steps))
     squares = jnp.sum(by_term(residuals(ends)[0]) ** 2, axis=2)
-    mixed = best_of_each_place(blame, ends, squares)[None]
+    mixed = kept(best_of_each_place(blame, ends, squares)[None])
     last = jnp.sum(by_term(residuals(mixed)[0]) ** 2, axis=2)
     losses = jnp.sum(jnp.concatenate([squares, last]), axis=1) / 2
     losses = jnp.where(jnp.isfinite(losses), losses, jnp.inf)
     best = jnp.argmin(losses)
     there = jnp.isfinite(losses[best])
     theta = jnp.where(there, jnp.concatenate([ends, mixed])[best], params.theta)
-    return theta, jnp.where(there, losses[best], 0)
+    return theta, losses[best]

@@ -15,17 +15,18 @@ from smoothdiff._estimate import combine
 from smoothdiff._named_baselines import as_baseline
 from smoothdiff._params import Params, take_apart
 from smoothdiff._samplers import AbstractSampler, Sobol
+from smoothdiff._seen import watched
 from smoothdiff._solvers._base import (
     AbstractSmoothSolver,
     Progress,
     all_finite,
-    judge,
     promotion,
     read_options,
     smoothed_params,
     stopped,
     unless_failed,
 )
+from smoothdiff._solvers._judgement import judged, judging, one_by_one
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._noisy_step import outcome, propose, revise
 from smoothdiff._solvers._restarts import Restarts, check_restarts
@@ -170,8 +171,8 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         return 4 + int(3 * math.log(size))
 
     def final_evaluations(self, y: PyTree[Array]) -> int:
-        """A batch for each of the three candidates."""
-        return 3 * self.evaluations_per_step(y)
+        """Those that judge the start, the last point, the accepted one and the best estimate."""
+        return judging(self.evaluations_per_step(y), new=4)
 
     def _kept(self, y: PyTree[Array], n: int) -> int:
         usual = min(max((n + 1) * (n + 2), _FEWEST), 512, max(_MEMORY // n, 64))
@@ -183,7 +184,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
 
         def fun(u: Array, _: list) -> tuple[Array, PyTree]:
             x = _bounded(params, metric, params.theta, u, width, mirror=True)
-            return fn(params.layout.tree(x), args)
+            return watched(fn, args)(params.layout.tree(x))
 
         batch = evaluate(
             fun,
@@ -215,6 +216,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         theta = params.theta
         metric = self._metric(search.metric, params)
         batch = self._batch(fn, y, args, params, metric, trust.width, progress.step, options)
+        seen = batch.aux.lowest()
         z = batch.draws.map(lambda z, _: z)
         points = jax.vmap(lambda u: _bounded(params, metric, theta, u, trust.width, mirror=True))(z)
         fresh = jnp.isfinite(batch.values) if batch.valid is None else batch.valid
@@ -260,6 +262,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
             trust.width * metric.widest(),
             len(z),
             finite,
+            seen,
         )
         restarts = state.restarts
         if restarts is not None:
@@ -272,8 +275,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
                 new_search.done(self.patience), (new_y, new_search), (start, first)
             )
         # the function was never evaluated at y itself, so its aux is that of a sample near y
-        aux = jax.tree.map(lambda a: a[0], batch.aux)
-        return new_y, NewtonCGState(progress, new_search, restarts), aux
+        return new_y, NewtonCGState(progress, new_search, restarts), seen.aux
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """After `patience` steps in a row that led nowhere, or a failed step."""
@@ -284,7 +286,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         return "noise" if state.search.trust.blind else "converged"
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        """Judges the last point, the last accepted and the best recorded on fresh samples."""
+        """Judges all that was seen, the start, the last two points and the best estimate."""
         progress, search = state.progress, state.search
         # with restarts, on the width on which the lowest estimate was made
         kernel = search.metric, search.trust.width
@@ -295,13 +297,14 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
             metric = self._metric(turned, params)
             batch = self._batch(fn, y, args, params, metric, wide, progress.step, options)
             value = combine(batch, jnp.zeros_like(params.theta))
-            return value, value_stderr(batch, value)
+            return value, value_stderr(batch, value), batch.aux.lowest()
 
         params = smoothed_params(self, y, progress.step, options)
         accepted = params.layout.tree(search.accepted)
-        y, fun, stderr = judge(estimate, y, accepted, progress.best_y)
-        evaluations = progress.evaluations + self.final_evaluations(y)
-        return y, aux, {"fun": fun, "stderr": stderr, "evaluations": evaluations}
+        new = y, accepted, progress.best_y, progress.start_y
+        values = one_by_one(fn, args, None)
+        y, stats = judged(progress, values, estimate, self.evaluations_per_step(y), new)
+        return y, aux, stats
 
 
 def _adapted(metric: Metric, model: ScalarFit, at: Array) -> tuple[Metric, Metric]:

@@ -12,11 +12,11 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from smoothdiff._params import Params
 from smoothdiff._samplers import AbstractSampler, Gaussian
+from smoothdiff._seen import watched
 from smoothdiff._solvers._base import (
     AbstractSmoothSolver,
     Progress,
     all_finite,
-    judge,
     promotion,
     read_options,
     sigma_at,
@@ -25,6 +25,7 @@ from smoothdiff._solvers._base import (
     unless_failed,
 )
 from smoothdiff._solvers._descent import descended, in_units
+from smoothdiff._solvers._judgement import judged, judging, one_by_one
 from smoothdiff._solvers._locality import Locality, inner_width, log, share
 from smoothdiff._solvers._replay import Replay
 from smoothdiff._solvers._surrogate_fit import Fit, Settings
@@ -59,8 +60,8 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
     `num_samples` evaluations a step serves all updates; the noise of a batch changes the weights of
     the surrogate a little, and the gradient follows from all batches so far. The surrogate sees
     points in units of sigma from the start, and values in units of their running mean deviation,
-    so a run does not depend on the scale of the function. The point returned is the better of the
-    last iterate and the one of lowest estimate, by a fresh batch each.
+    so a run does not depend on the scale of the function. Candidates for the point returned, beside
+    the lowest that was evaluated, are the last iterate, the one of lowest estimate and the start.
 
     The defaults are the paper's but for `replay` and what goes with it, the rate, the units,
     and the network and `num_samples` in many dimensions. Its ablations are `inner_sigma=0`
@@ -205,8 +206,8 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
         return self.num_samples
 
     def final_evaluations(self, y: PyTree[Array]) -> int:
-        """A batch for each of the two candidates."""
-        return 2 * self.num_samples
+        """Those that judge the start, the last iterate and the best estimate."""
+        return judging(self.num_samples, new=3)
 
     def _make(self, params: Params, options: dict[str, Any]) -> tuple[PyTree, PyTree]:
         """The surrogate before any fit: its weights, and the rest of it."""
@@ -277,7 +278,8 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
         progress = state.progress
         params = smoothed_params(self, y, progress.step, options)
         locality = self._locality(params, y, progress.step, options)
-        rho, batch = locality.around(lambda y: fn(y, args))
+        rho, batch = locality.around(watched(fn, args))
+        seen = batch.aux.lowest()
         _, rest = self._make(params, options)
         fit = state.fit.updated(
             rest,
@@ -307,24 +309,27 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
         )
         fun, stderr = locality.mean(batch)
         sigma = sigma_at(self.sigma, progress.step)
-        progress = progress.after(y, fun, stderr, sigma, self.num_samples, finite)
+        progress = progress.after(y, fun, stderr, sigma, self.num_samples, finite, seen)
         # the function was never evaluated at y itself, so its aux is that of a sample near y
-        aux = jax.tree.map(lambda a: a[0], batch.aux)
-        return new_y, ZeroGradsState(progress, fit, opt_state, quiet), aux
+        return new_y, ZeroGradsState(progress, fit, opt_state, quiet), seen.aux
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """After small updates in a row, or a failed step."""
         return stopped(state.progress, state.quiet >= _PATIENCE)
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        """Judges the last iterate and the best recorded, smoothed by the inner kernel alone."""
+        """Judges all that was seen, the start, the last iterate and the best estimate.
+
+        What is smoothed around the winner is smoothed by the inner kernel alone.
+        """
         progress = state.progress
 
         def estimate(y):
             params = smoothed_params(self, y, progress.step, options)
             locality = self._locality(params, y, progress.step, options)
-            return locality.mean(locality.smoothed(lambda y: fn(y, args)))
+            batch = locality.smoothed(watched(fn, args))
+            return (*locality.mean(batch), batch.aux.lowest())
 
-        y, fun, stderr = judge(estimate, y, progress.best_y)
-        evaluations = progress.evaluations + self.final_evaluations(y)
-        return y, aux, {"fun": fun, "stderr": stderr, "evaluations": evaluations}
+        new = y, progress.best_y, progress.start_y
+        y, stats = judged(progress, one_by_one(fn, args, None), estimate, self.num_samples, new)
+        return y, aux, stats

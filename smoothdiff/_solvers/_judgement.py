@@ -1,0 +1,115 @@
+"""The last judgement: of all that a run has seen, what it returns."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PyTree
+
+from smoothdiff._seen import Seen
+from smoothdiff._solvers._base import Progress
+
+# how often each candidate is evaluated where the function is noisy
+_REPEATS = 3
+# what rounding may do to a value that another program computes again, in units of its own
+_ROUNDING = 64
+
+
+def judged(
+    progress: Progress,
+    values: Callable[[PyTree[Array]], Float[Array, " m"]],
+    estimate: Callable[[PyTree[Array]], tuple[Array, Array, Seen]],
+    batch: int,
+    new: Sequence[PyTree[Array]],
+    old: Sequence[PyTree[Array]] = (),
+) -> tuple[PyTree[Array], dict[str, Array]]:
+    """The best point and the statistics of the run.
+
+    The lowest point that was evaluated is evaluated again, together with the `new` candidates. If
+    its value is the same, the function has no noise, and the lowest of these points is the answer.
+    If not, its value was luck: then all candidates, the `old` ones too, are evaluated until there
+    are three values of each, and the lowest mean is the answer.
+
+    A last batch around the answer gives the smoothed function there. Without noise, a point of that
+    batch which is lower still takes the answer's place.
+
+    Args:
+        progress: Of the run.
+        values: The function itself, at stacked points.
+        estimate: y -> the smoothed function, its standard error, the lowest of the fresh batch
+            behind them.
+        batch: The evaluations that `estimate` makes.
+        new: Candidates that were never evaluated.
+        old: Candidates that were, so that without noise none of them is lower than the lowest.
+
+    Returns:
+        The point, and the statistics: `fun`, the function there; `smoothed` and `stderr`, from the
+        last batch; and the `evaluations` of the run. A candidate at which the function is not
+        finite loses; of equals the first of the `new` ones wins, as on a plateau an iterate is
+        further from the edges than a sample.
+    """
+    candidates = *new, progress.lowest_y, *old
+    points = jax.tree.map(lambda *leaves: jnp.stack(leaves), *candidates)
+    count, each = len(candidates), 1 + len(new)
+    rounds = _rounds(count, each)
+    dtype = progress.fun.dtype
+
+    def more(state: tuple[Array, Array]) -> Bool[Array, ""]:
+        done, found = state
+        return (done == 0) | ((done < rounds) & _differ(found[each - 1], progress.lowest_fun))
+
+    # one loop, so that the function is compiled once, and every value of a point by one program
+    def evaluated(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        done, found = state
+        at = (each * done + jnp.arange(each, dtype=jnp.int32)) % count
+        fresh = values(jax.tree.map(lambda a: a[at], points)).astype(dtype)
+        return done + 1, jax.lax.dynamic_update_slice(found, fresh, (each * done,))
+
+    none = jnp.asarray(0, jnp.int32), jnp.full(rounds * each, jnp.nan, dtype)
+    done, found = jax.lax.while_loop(more, evaluated, none)
+    table = found[: _REPEATS * count].reshape(_REPEATS, count)
+    finite = jnp.isfinite(table)
+    least = jnp.min(jnp.where(finite, table, jnp.inf), axis=0)
+    above = jnp.where(finite, table - least[None], 0)
+    noisy = jnp.any(above > 0)
+    # so that the mean of equal values is that value, to the last bit
+    times = jnp.maximum(jnp.sum(finite, axis=0), 1).astype(dtype)
+    means = least + jnp.sum(above, axis=0) / times
+    winner = jnp.argmin(means)
+    y = jax.tree.map(lambda a: a[winner], points)
+
+    smoothed, stderr, seen = estimate(y)
+    fun, last = means[winner], seen.value.astype(dtype)
+    lower = ~noisy & (last < fun)
+    y, fun = jax.tree.map(lambda a, b: jnp.where(lower, a, b), (seen.point, last), (y, fun))
+    evaluations = progress.evaluations + each * done + batch
+    return y, {"fun": fun, "smoothed": smoothed, "stderr": stderr, "evaluations": evaluations}
+
+
+def judging(batch: int, new: int, old: int = 0) -> int:
+    """The most evaluations that `judged` makes for so many candidates."""
+    return _rounds(1 + new + old, 1 + new) * (1 + new) + batch
+
+
+def one_by_one(
+    fn: Callable, args: Any, batch_size: int | None
+) -> Callable[[PyTree[Array]], Float[Array, " m"]]:
+    """The function at stacked points, at most so many of them at a time."""
+
+    def values(points: PyTree[Array]) -> Array:
+        size = batch_size or len(jax.tree.leaves(points)[0])
+        return jax.lax.map(lambda y: fn(y, args)[0], points, batch_size=size)
+
+    return values
+
+
+def _rounds(count: int, each: int) -> int:
+    """How often so many are evaluated until there are enough values of all."""
+    return -(-_REPEATS * count // each)
+
+
+def _differ(again: Float[Array, ""], before: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether a value that was computed twice differs by more than rounding."""
+    eps = _ROUNDING * jnp.finfo(before.dtype).eps
+    return jnp.isfinite(before) & ~(jnp.abs(again - before) <= eps * jnp.abs(before))

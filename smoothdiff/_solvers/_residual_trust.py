@@ -1,0 +1,201 @@
+r"""Gauss-Newton within a trust region, one evaluation a step: while a local model predicts.
+
+Around the best point the residuals are modelled as $r + J u$. J is the weighted least-squares fit
+to the nearest evaluations that differs least from the last J, so n + 1 evaluations are enough to
+begin with, and each one after it makes the model better where the search goes.
+
+Source: own; the first points and the ratio test are those of DFO-LS (Cartis, Fiala, Marteau and
+Roberts, 2019), the least change is Broyden's.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from smoothdiff._solvers._base import dot
+from smoothdiff._solvers._bounded_step import bounded_step
+from smoothdiff._solvers._residual_history import History
+
+# evaluations that a fit may use for each parameter, and how far they count, in radii
+_USED, _REACH, _FARTHEST = 3, 1.5, 2.0
+# what is not known of a direction that hardly any evaluation has, against the others, squared
+_RIDGE = 1e-8
+# the acceptance ratio of a step that fails, and of one after which the radius may grow
+_FAILED, _HELD = 0.1, 0.7
+# ... if the change of the residuals was predicted with an error below this share
+_PREDICTED = 0.5
+# a direction with less than this share of the radius is not covered by evaluations
+_COVERED = 0.2
+# the radius after a failure, in lengths of the step
+_SMALLEST, _LARGEST = 0.1, 0.5
+# so many steps in a row that fail, or fail and are rough, are too many; of the latter one, where no
+# step worked yet
+_FAILS, _ROUGH = 8, 2
+# ... and so many evaluations for each parameter that lower the loss by less than this share
+_SLOW, _LITTLE = 3, 0.01
+# a shorter step should lower the error of the prediction by this factor, or the function is rough
+_SMOOTH = 0.8
+
+
+class Proposal(NamedTuple):
+    """Steps to evaluate, in units of sigma, and what the model says of them."""
+
+    steps: Float[Array, "K n"]
+    predicted: Float[Array, "K P"]
+    promised: Float[Array, " K"]
+    slope: Float[Array, " K"]
+    jacobian: Float[Array, "n P"]
+    poor: Bool[Array, ""]
+
+
+class TrustRegion(eqx.Module):
+    """How far the model is trusted, in units of sigma, and the last model.
+
+    `improve` says that the next evaluation is for the geometry of the points, not for a step.
+    `fails` counts the steps in a row that failed, `rough` those of them that were shorter than the
+    one before and predicted no better, as happens where a function jumps, or changed nothing at
+    all; `error` and `length` are those of the last one. `worked` says that some step did not fail,
+    and `slow` counts the evaluations in a row that lowered the loss by little or nothing.
+    """
+
+    radius: Float[Array, ""]
+    jacobian: Float[Array, "n P"]
+    improve: Bool[Array, ""]
+    fails: Int[Array, ""]
+    rough: Int[Array, ""]
+    error: Float[Array, ""]
+    length: Float[Array, ""]
+    worked: Bool[Array, ""]
+    slow: Int[Array, ""]
+
+    @staticmethod
+    def start(radius: Float[Array, ""], n: int, size: int) -> "TrustRegion":
+        """Nothing is known of the function."""
+        none, zero = jnp.zeros((), jnp.int32), jnp.zeros_like(radius)
+        jacobian = jnp.zeros((n, size), radius.dtype)
+        no = jnp.asarray(False)
+        return TrustRegion(radius, jacobian, no, none, none, zero, zero, no, none)
+
+    def failed(self) -> Bool[Array, ""]:
+        """Whether a local model is of no use."""
+        return (
+            (self.fails >= _FAILS)
+            | (self.slow >= _SLOW * (len(self.jacobian) + 1))
+            | (self.rough >= jnp.where(self.worked, _ROUGH, 1))
+        )
+
+    def propose(
+        self,
+        history: History,
+        center: Float[Array, " n"],
+        row: Float[Array, " P"],
+        sigma: Float[Array, " n"],
+        sides: tuple[Array | None, Array | None],
+        count: int,
+    ) -> Proposal:
+        """Minimisers of the model within this radius and others, or a point for the geometry."""
+        jacobian, lacking, poor = self._fit(history, center, row, sigma)
+        hessian, grad = dot(jacobian, jacobian.T), dot(jacobian, row)
+        power = jnp.asarray([(j + 1) // 2 * (-1) ** j for j in range(count)], row.dtype)
+        radii = self.radius * 2.0**-power
+        steps = jax.vmap(lambda radius: bounded_step(hessian, grad, radius, *sides))(radii)
+        change, slope = dot(steps, jacobian), -dot(steps, grad)
+        promised = slope - jnp.sum(change**2, axis=1) / 2
+        # where the model asks for nothing, a point that teaches it something
+        eps = jnp.finfo(row.dtype).eps
+        improve = self.improve | ~(promised[0] > eps * jnp.sum(row**2))
+        other = _roomy(self.radius * lacking, *sides)
+        steps = steps.at[0].set(jnp.where(improve, other, steps[0]))
+        promised = promised.at[0].set(jnp.where(improve, 0, promised[0]))
+        return Proposal(steps, row[None] + change, promised, slope, jacobian, poor)
+
+    def _fit(
+        self, history: History, center: Array, row: Array, sigma: Array
+    ) -> tuple[Array, Array, Array]:
+        """The Jacobian; the direction that is covered least, and whether that is too little."""
+        n = len(center)
+        tiny = jnp.finfo(row.dtype).tiny
+        away = (history.points - center[None]) / sigma[None]
+        all_of_them = jnp.where(history.valid, jnp.linalg.norm(away, axis=1), jnp.inf)
+        count = min(_USED * (n + 1), len(away))
+        nearest: Array
+        nearest, near = jax.lax.top_k(-jnp.asarray(all_of_them), count)
+        distance = -nearest
+        # as wide as n evaluations, the center not counted, or the whole region
+        farthest = jnp.max(jnp.where(jnp.isfinite(distance[: n + 1]), distance[: n + 1], 0))
+        width = jnp.maximum(jnp.maximum(self.radius, farthest), tiny)
+        used = distance <= _FARTHEST * width
+        far = jnp.asarray(jnp.where(used, distance, 0)) / width
+        weight = jnp.where(used, 1 / (1 + (far / _REACH) ** 4), 0)
+        a = jnp.where(used[:, None], away[near], 0) / width
+        change = jnp.where(used[:, None], history.residuals[near] - row[None], 0)
+        normal = dot((a * weight[:, None]).T, a)
+        ridge = _RIDGE * jnp.trace(normal) / n + tiny
+        size = jnp.arange(n)
+        old = self.jacobian * width
+        side = dot((a * weight[:, None]).T, change - dot(a, old))
+        correction = jnp.linalg.solve(normal.at[size, size].add(ridge), side)
+        new = jnp.where(jnp.all(jnp.isfinite(correction)), old + correction, old)
+        jacobian = jnp.asarray(new) / width
+        close = far <= _FARTHEST * jnp.maximum(self.radius / width, 0.05)
+        covered, directions = jnp.linalg.eigh(dot(jnp.where(close[:, None], a, 0).T, a))
+        least = jnp.sqrt(jnp.maximum(covered[0], 0))
+        return jacobian, directions[:, 0], least < _COVERED * self.radius / width
+
+    def revise(
+        self, proposal: Proposal, row: Float[Array, " P"], rows: Float[Array, "K P"], good: Array
+    ) -> "TrustRegion":
+        """The region after the residuals `rows` came."""
+        before = jnp.sum(row**2) / 2
+        funs = jnp.where(good, jnp.sum(rows**2, axis=1) / 2, jnp.inf)
+        best = jnp.argmin(funs)
+        fun, promised = funs[best], proposal.promised[best]
+        length: Array = jnp.linalg.norm(proposal.steps[best])
+        tiny = jnp.finfo(row.dtype).tiny
+        ratio = jnp.where(promised > 0, (before - fun) / jnp.maximum(promised, tiny), 0)
+        off = jnp.linalg.norm(rows[best] - proposal.predicted[best])
+        expected = jnp.linalg.norm(proposal.predicted[best] - row)
+        error = off / jnp.maximum(expected, tiny)
+        error = jnp.asarray(jnp.where(jnp.isfinite(fun), error, jnp.inf))
+        same = jnp.all(rows[best] == row)
+        tried = promised > 0
+        failed = tried & ~(ratio > _FAILED)
+        fails = jnp.where(failed, self.fails + 1, jnp.where(tried, 0, self.fails))
+        shorter = (self.fails > 0) & (length < 0.6 * self.length)
+        more = same | (shorter & (error >= _SMOOTH * self.error))
+        rough = jnp.where(more, self.rough + 1, self.rough)
+        rough = jnp.asarray(jnp.where(failed, rough, jnp.where(tried, 0, self.rough)))
+        # the lowest point of the parabola through both values and the slope
+        slope = proposal.slope[best]
+        share = slope / jnp.maximum(2 * (fun - before + slope), tiny)
+        share = jnp.clip(jnp.where(jnp.isfinite(fun), share, 0), _SMALLEST, _LARGEST)
+        lower = jnp.minimum(self.radius, length) * share
+        wait = proposal.poor & (fails < 2) & ~self.improve
+        radius = jnp.where(failed & ~wait, lower, self.radius)
+        grow = tried & (ratio > _HELD) & (error < _PREDICTED)
+        radius = jnp.where(grow, jnp.maximum(radius, 2 * length), radius)
+        radius = jnp.where(~tried & ~self.improve, 0.5 * radius, radius)
+        improve = failed & proposal.poor & ~self.improve
+        revised = TrustRegion(
+            radius=radius,
+            jacobian=proposal.jacobian,
+            improve=improve,
+            fails=fails,
+            rough=rough.astype(fails.dtype),
+            error=jnp.where(failed, error, self.error),
+            length=jnp.where(failed, length, self.length),
+            slow=jnp.where(fun < (1 - _LITTLE) * before, 0, self.slow + len(rows)),
+            worked=self.worked | (tried & ~failed),
+        )
+        return revised
+
+
+def _roomy(step: Array, low: Array | None, high: Array | None) -> Array:
+    """The step or its opposite, whichever the bounds leave longer."""
+    if low is None or high is None:
+        return step
+    forth, back = jnp.clip(step, low, high), jnp.clip(-step, low, high)
+    return jnp.where(jnp.linalg.norm(forth) >= jnp.linalg.norm(back), forth, back)

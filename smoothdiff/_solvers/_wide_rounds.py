@@ -1,0 +1,122 @@
+"""Rounds of samples around a center, and the regression that moves it: where functions jump."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from smoothdiff._params import Params
+from smoothdiff._solvers._parameter_regression import gauss_newton_step
+from smoothdiff._solvers._residual_history import History
+
+# sigma follows twice the standard error of the step, at most so much smaller or larger at a time
+_SHRINK, _GROW = 0.25, 1.5
+# ... and no wider than so many times what the user gave, unless all samples are the same
+_WIDEST = 2.0
+# the longest step of any parameter, in units of its sigma: beyond it nothing has been seen
+LONGEST = 2.0
+# a step is tried so many times as far, where that is at least sigma
+_FURTHER = 5.0
+
+
+class Wide(eqx.Module):
+    """A round of samples: `taken` of them so far, `scale` wide, around the end of the last `move`.
+
+    `rounds` counts them, `true` those in a row that came true, `idle` the evaluations without a
+    lower point, `found` says that there was one, `before` is the loss at the last
+    center, `row` the residuals at this one, and `seen` says that the last samples were not the
+    same.
+    """
+
+    center: Float[Array, " n"]
+    row: Float[Array, " P"]
+    move: Float[Array, " n"]
+    scale: Float[Array, ""]
+    before: Float[Array, ""]
+    taken: Int[Array, ""]
+    rounds: Int[Array, ""]
+    true: Int[Array, ""]
+    idle: Int[Array, ""]
+    found: Bool[Array, ""]
+    seen: Bool[Array, ""]
+
+    @staticmethod
+    def start(center: Array, row: Array, scale: Array) -> "Wide":
+        """The first round, around a point that is known."""
+        none = jnp.zeros((), jnp.int32)
+        before = jnp.asarray(jnp.inf, row.dtype)
+        still = jnp.zeros_like(center)
+        no = jnp.asarray(False)
+        return Wide(center, row, still, scale, before, none, none, none, none, no, no)
+
+    def further(self, sigma: Float[Array, " n"]) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
+        """A step on in the direction of the last one, and whether it is worth an evaluation."""
+        step = _FURTHER * self.move
+        return step, jnp.mean((step / sigma) ** 2) > 1
+
+    def stepped(self, history: History, params: Params, count: Array) -> "Wide":
+        """The regression over the round and what was before it; the next round."""
+        sigma = params.sigma * self.scale
+        center, here = history.lowest(self.center, self.row)
+        u = (history.points - center[None]) / sigma[None]
+        sides = sides_of(params, center, sigma)
+        move, error = gauss_newton_step(u, history.residuals, history.valid, *sides)
+        longest = jnp.max(jnp.abs(move))
+        move = move / jnp.maximum(1, longest / LONGEST)
+        theta = params.clip(center + sigma * move)
+        fresh = history.valid & (jnp.arange(len(u)) >= len(u) - count)
+        some = history.residuals[jnp.argmax(fresh)]
+        same = jnp.all(jnp.where(fresh[:, None], history.residuals == some[None], True))
+        # a few that are the same call for more of them first
+        flat = same & ~self.seen
+        scale = next_scale(self.scale, flat, history, here, u, error, longest / LONGEST)
+        finite = jnp.all(jnp.isfinite(theta)) & jnp.isfinite(scale)
+        return Wide(
+            center=jnp.where(finite, theta, center),
+            row=self.row,
+            move=jnp.where(finite, theta - self.center, 0),
+            scale=jnp.where(finite, scale, self.scale / 2),
+            before=self.before,
+            taken=jnp.zeros_like(self.taken),
+            rounds=self.rounds + 1,
+            true=self.true,
+            idle=self.idle,
+            found=self.found,
+            seen=~same,
+        )
+
+
+def sides_of(
+    params: Params, center: Array, sigma: Array | None = None
+) -> tuple[Array | None, Array | None]:
+    """The bounds as seen from a point, in units of sigma."""
+    sigma = params.sigma if sigma is None else sigma
+    low, high = (None if s is None else (s - center) / sigma for s in (params.low, params.high))
+    return low, high
+
+
+def next_scale(
+    scale: Float[Array, ""],
+    flat: Bool[Array, ""],
+    history: History,
+    here: Float[Array, " P"],
+    u: Float[Array, "M n"],
+    error: Float[Array, " n"],
+    length: Float[Array, ""],
+) -> Float[Array, ""]:
+    """How wide the next samples are, relative to sigma.
+
+    Args:
+        scale: That of these.
+        flat: All of them are the same; then the next ones are twice as wide.
+        history: All samples, these included.
+        here: The residuals where the step starts, at the iterate or a better point.
+        u: The points of the history as seen from there.
+        error: The standard error of the step.
+        length: Of the step.
+    """
+    # a plateau of the residuals around the iterate is seen whole or not at all
+    plateau = history.valid & jnp.all(history.residuals == here[None], axis=1)
+    extent = jnp.max(jnp.where(plateau, jnp.sqrt(jnp.mean(u**2, axis=1)), 0))
+    wanted = jnp.maximum(2 * jnp.sqrt(jnp.mean(error**2)), length)
+    wanted = jnp.clip(jnp.maximum(wanted, extent), _SHRINK, _GROW)
+    return jnp.where(flat, 2 * scale, jnp.minimum(wanted * scale, _WIDEST))

@@ -1,0 +1,247 @@
+"""What a run returns: without noise the lowest of all that was evaluated, with noise a fair winner.
+
+The problems are branches of one black box, so that each solver is compiled once for all of them.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+import smoothdiff as sd
+from smoothdiff._seen import Seen
+from smoothdiff._solvers._base import Progress
+from smoothdiff._solvers._judgement import judged, judging
+
+KEY = jax.random.key(2)
+TARGET = np.array([0.6, -0.4], np.float32)
+START = np.zeros(2, np.float32)
+LIKE = jnp.asarray(START)
+LOW, HIGH = np.array([-1.0, -1.0], np.float32), np.array([0.55, 2.0], np.float32)
+
+
+# residuals, one for each parameter; a loss is half the sum of their squares
+
+
+def stair(y):
+    return np.floor(4 * np.abs(y - TARGET)) + 1
+
+
+def jump(y):
+    return y - TARGET + 3 * (y[0] < 0.2)
+
+
+def tail(y):
+    """The loss is up to 1e30."""
+    return (y - TARGET) * 10 ** np.minimum(20 * np.abs(y - TARGET), 15)
+
+
+def hole(y):
+    return np.where(y[1] > 0.2, np.nan, y - TARGET)
+
+
+def bowl(y):
+    return y - TARGET
+
+
+class Host:
+    """A black box that remembers all points and values, without noise or with."""
+
+    def __init__(self):
+        self.new(bowl)
+        one, two = (jax.ShapeDtypeStruct(shape, jnp.float32) for shape in [(), (2,)])
+        box = functools.partial(sd.black_box, on_nonfinite="nan")
+        self._loss, self._rows = box(self._one, one), box(self._two, two)
+
+    def new(self, problem, noise=0.0):
+        self.problem, self.noise, self.points, self.values = problem, noise, [], []
+        self.random = np.random.default_rng(0)
+
+    def _two(self, y):
+        rows = np.float32(self.problem(y) + self.noise * self.random.normal(size=2))
+        self.points.append(np.array(y))
+        self.values.append(np.sum(rows**2) / 2)
+        return rows
+
+    def _one(self, y):
+        self._two(y)
+        return self.values[-1]
+
+    def loss(self, y, args):
+        return self._loss(y)
+
+    def rows(self, y, args):
+        return self._rows(y)
+
+    def truth(self, y):
+        return np.sum(np.float32(self.problem(np.asarray(y))) ** 2) / 2
+
+
+HOST = Host()
+LOSS, ROWS = HOST.loss, HOST.rows  # the same objects each time, so that they are compiled once
+SETTINGS = {
+    "first order": lambda: sd.FirstOrder(optax.adam(0.1), 0.3, nonfinite="drop"),
+    "chunks": lambda: sd.FirstOrder(optax.adam(0.1), 0.3, batch_size=3, nonfinite="drop"),
+    "newton": lambda: sd.NewtonCG(0.3, nonfinite="drop"),
+    "restarts": lambda: sd.NewtonCG(0.3, nonfinite="drop", patience=2, restarts=3),
+    "zerograds": lambda: sd.ZeroGrads(0.3, num_samples=8, nonfinite="drop"),
+    "gauss-newton": lambda: sd.GaussNewton(0.3, nonfinite="drop"),
+    "local": lambda: sd.LocalGaussNewton(0.3, lambda y: y, nonfinite="drop"),
+}
+
+
+class Run:
+    """One of the solvers on the problem of the black box."""
+
+    def __init__(self, solver):
+        self.solver = solver
+        self.of_residuals = isinstance(solver, sd.GaussNewton | sd.LocalGaussNewton)
+
+    def __call__(self, problem, y0=START, noise=0.0, **limits):
+        HOST.new(problem, noise)
+        limits = {"bounds": (LOW, HIGH), "key": KEY} | (limits or {"max_steps": 5})
+        minimise = sd.least_squares if self.of_residuals else sd.minimise
+        fun = ROWS if self.of_residuals else LOSS
+        try:
+            return minimise(fun, y0, solver=self.solver, **limits)
+        except sd.MinimiseError as error:
+            return error.result
+
+
+@pytest.fixture(scope="module", params=SETTINGS)
+def run(request):
+    return Run(SETTINGS[request.param]())
+
+
+def assert_lowest(result):
+    """It is the lowest of all that the black box was called with, which is what is reported."""
+    assert result.evaluations == len(HOST.points)
+    assert np.nanmin(HOST.values) == HOST.truth(result.y) == pytest.approx(result.fun, rel=1e-6)
+    # to the last bit, so that what is returned is nothing that nobody looked at
+    assert any(np.array_equal(result.y, y) for y in HOST.points)
+    points = np.stack(HOST.points)
+    assert np.all((points >= LOW) & (points <= HIGH))
+
+
+@pytest.mark.parametrize("problem", [stair, jump, tail, hole], ids=lambda f: f.__name__)
+def test_without_noise_it_is_the_lowest_of_all_that_was_evaluated(problem, run):
+    result = run(problem)
+    assert_lowest(result)
+    assert result.fun < HOST.truth(START)
+    if problem is hole:
+        # or the test would show nothing
+        assert np.isnan(HOST.values).any()
+    if problem is tail:
+        assert np.max(HOST.values) > 1e12
+
+
+def test_a_start_that_is_the_optimum_is_returned(run):
+    best = np.minimum(TARGET, HIGH)
+    result = run(bowl, best)
+    assert_lowest(result)
+    np.testing.assert_array_equal(result.y, best)
+
+
+def test_with_noise_it_is_no_worse_than_the_start_but_for_the_noise(run):
+    noise = 0.1
+    best = np.minimum(TARGET, HIGH)
+    result = run(bowl, best, noise)
+    # the loss at the start varies by 0.05 noise + noise^2, and the mean of three by less
+    assert HOST.truth(result.y) < HOST.truth(best) + 4 * (0.05 * noise + noise**2)
+    # the lowest value is luck, and not what is reported
+    assert np.min(HOST.values) < result.fun
+    before = result.history[-1].evaluations
+    fresh = [
+        value
+        for point, value in zip(HOST.points[before:], HOST.values[before:], strict=True)
+        if np.array_equal(point, result.y)
+    ]
+    assert len(fresh) >= 3
+    assert np.min(fresh) < result.fun < np.max(fresh)
+    assert result.evaluations == len(HOST.points) == before + run.solver.final_evaluations(LIKE)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_the_budget_is_not_exceeded(noise, run):
+    step, last = run.solver.evaluations_per_step(LIKE), run.solver.final_evaluations(LIKE)
+    budget = 3 * step + last
+    result = run(bowl, START, noise, max_evaluations=budget)
+    assert result.reason == "max_evaluations"
+    assert len(result.history) >= 3
+    assert result.evaluations == len(HOST.points) <= budget
+
+
+def test_without_noise_little_is_spent_on_the_judgement(run):
+    """The lowest again, each candidate that was not evaluated yet, and a batch."""
+    result = run(bowl)
+    took = result.evaluations - result.history[-1].evaluations
+    step = run.solver.evaluations_per_step(LIKE)
+    candidates = 1 if run.of_residuals else 4
+    assert took <= 1 + candidates + step
+
+
+def test_a_run_that_was_interrupted_returns_the_lowest(run):
+    def stop(record):
+        if record.step == 3:
+            raise KeyboardInterrupt
+
+    result = run(stair, max_steps=5, callback=stop)
+    assert result.reason == "interrupted"
+    assert_lowest(result)
+    assert np.isnan([result.smoothed, result.stderr]).all()
+
+
+# the judgement alone
+
+
+def judge(fun, seen, new, old=()):
+    """Of a run that saw this point with this value."""
+    first = jnp.asarray(new[0])
+    progress = Progress.start(first, jnp.float32)
+    finite = jnp.asarray(True)
+    estimate = first, jnp.float32(0), jnp.float32(0), 1.0
+    progress = progress.after(*estimate, 10, finite, Seen(jnp.asarray(seen[0]), seen[1]))
+    batch = lambda y: (fun(y), jnp.float32(0), Seen(y, fun(y)))
+    return judged(progress, jax.vmap(fun), batch, 4, new, old)
+
+
+def test_candidates_that_are_not_finite_lose_and_the_first_of_equals_wins():
+    points = jnp.array([[4.0, 1.0, 5.0], [1.0, -1.0, -1.0], [-1.0, -1.0, -1.0], [9.0, -9.0, 9.0]])
+
+    @jax.vmap
+    def best(p):
+        fun = lambda y: jnp.sqrt(y) // 1
+        return judge(fun, (jnp.float32(9.5), jnp.float32(3)), [p[0], p[1]], [p[2]])
+
+    y, stats = best(points)
+    np.testing.assert_array_equal(y, [1, 1, 9.5, 9])
+    np.testing.assert_array_equal(stats["fun"], [1, 1, 3, 3])
+    np.testing.assert_array_equal(stats["evaluations"], 10 + 3 + 4)
+
+
+def test_what_rounding_does_is_no_noise_and_what_luck_did_is():
+    fun = lambda y: (y - 2) ** 2 + 1
+
+    @jax.vmap
+    def best(value):
+        return judge(fun, (jnp.float32(1), value), [jnp.float32(0)], [jnp.float32(3)])
+
+    close = np.float32(2) + np.spacing(np.float32(2)) * np.arange(-2, 3, dtype=np.float32)
+    y, stats = best(jnp.append(close, 0.5))
+    assert stats["evaluations"].tolist() == [10 + 2 + 4] * 5 + [10 + judging(4, 1, 1)]
+    assert judging(4, 1, 1) == 3 * 3 + 1 + 4
+    # the other candidate was seen before, so that nothing was to be expected of it without noise
+    np.testing.assert_array_equal(y, 1)
+    np.testing.assert_array_equal(stats["fun"], 2)
+
+
+def test_float64_residuals_of_float32_parameters_are_no_noise(x64):
+    fun = lambda y, args: jnp.cos(y.astype(jnp.float64)) * jnp.array([1.1, 0.3]) + 0.7
+    solver = sd.GaussNewton(0.3)
+    result = sd.least_squares(fun, START, key=KEY, solver=solver, max_steps=3)
+    assert result.y.dtype == jnp.float32
+    assert result.evaluations == result.history[-1].evaluations + 1
+    assert result.fun == pytest.approx(float(jnp.sum(fun(result.y, None) ** 2)) / 2, rel=1e-6)
