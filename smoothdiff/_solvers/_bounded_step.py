@@ -6,8 +6,8 @@ from jaxtyping import Array, Bool, Float
 
 from smoothdiff._solvers._base import dot
 
-# how often a step that crosses bounds is computed again with those parameters held
-_TIMES = 3
+# steps along the bounds at most, and the shares of each that are tried and clipped
+_TIMES, _SHARES = 10, tuple(2.0**-k for k in range(6))
 # Newton's method on the length of the step: from below it is monotone, and nearly quadratic
 _SECULAR = 12
 
@@ -19,30 +19,40 @@ def bounded_step(
     low: Float[Array, " n"] | None,
     high: Float[Array, " n"] | None,
 ) -> Float[Array, " n"]:
-    r"""Minimises $g \cdot p + \tfrac12 p \cdot H p$ over $|p| \le r$ and $l \le p \le h$, about.
+    r"""Minimises $g \cdot p + \tfrac12 p \cdot H p$ over $|p| \le r$ and $l \le p \le h$.
 
-    Exactly where no bound is met. A parameter that would cross one is put there, and the step of
-    the others is computed again. H may be indefinite.
+    Exactly, where no bound is met. Where one is, by steps from zero, each of them the minimiser
+    over the parameters that may still move, up to the first bound or clipped, whichever is lower.
+    So the model never rises; a corner of the region may then be further away than its radius. H may
+    be indefinite.
 
-    Source: Moré and Sorensen 1983.
+    Source: Moré and Sorensen 1983; Bertsekas 1982 for the bounds.
     """
     everything = jnp.ones(grad.shape, bool)
     if low is None or high is None:
         return _within(hessian, grad, radius, everything)
+    low, high = jnp.maximum(low, -radius), jnp.minimum(high, radius)
+    shares = jnp.asarray(_SHARES, grad.dtype)
 
     def again(carry: tuple) -> tuple:
         p: Array
-        free: Array
-        p, free, _, times = carry
-        held: Array = jnp.where(free, 0, p)
-        step = _within(hessian, grad + dot(hessian, held), radius, free)
-        step = jnp.where(free, step, held)
-        p = jnp.clip(step, low, high)
-        crossed = free & (p != step)
-        return p, free & ~crossed, jnp.any(crossed), times + 1
+        p, value, _, times = carry
+        slope = grad + dot(hessian, p)
+        free = ~(((p <= low) & (slope > 0)) | ((p >= high) & (slope < 0)))
+        step = _within(hessian, slope, radius, free)
+        room = jnp.where(step > 0, high - p, low - p)
+        moves = step != 0
+        first = jnp.min(jnp.where(moves, room / jnp.where(moves, step, 1), jnp.inf))
+        tried = jnp.append(shares, jnp.minimum(first, 1))
+        ends = jnp.clip(p[None] + tried[:, None] * step[None], low[None], high[None])
+        values = dot(ends, grad) + jnp.sum(dot(ends, hessian) * ends, axis=1) / 2
+        best = jnp.argmin(values)
+        lower = values[best] < value
+        p = jnp.where(lower, ends[best], p)
+        return p, jnp.minimum(values[best], value), lower, times + 1
 
     going = lambda carry: carry[2] & (carry[3] < _TIMES)
-    start = jnp.zeros_like(grad), everything, jnp.asarray(True), 0
+    start = jnp.zeros_like(grad), jnp.zeros_like(radius), jnp.asarray(True), 0
     return jax.lax.while_loop(going, again, start)[0]
 
 

@@ -1,6 +1,7 @@
 """Gauss-Newton with few parameters, on a function that is evaluated point by point."""
 
 import math
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -78,7 +79,8 @@ def step(
     params = smoothed_params(solver, y, progress.step, options)
     sizes = sizes_of(solver, y)
     key = read_options(options)[0]
-    points, proposal = search.propose(params, _samples(solver, key, search, params, sizes), sizes)
+    draw = partial(_samples, solver, key, search, params, sizes)
+    points, proposal = search.propose(params, draw, sizes)
     points = kept(jax.vmap(params.clip)(points))
     rows, aux = Residuals(fn, args, params, solver.batch_size)(points)
     good = jnp.isfinite(jnp.sum(rows**2, axis=1))

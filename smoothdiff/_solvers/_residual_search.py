@@ -6,6 +6,7 @@ its steps fail in a row, or most residuals do not move, a wide regression takes 
 samples around a center, which may go uphill, until its steps come true.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -107,15 +108,15 @@ class ResidualSearch(eqx.Module):
         return self.history.best(self.start)[0]
 
     def propose(
-        self, params: Params, samples: Float[Array, "first n"], sizes: Sizes
+        self, params: Params, draw: Callable[[], Float[Array, "first n"]], sizes: Sizes
     ) -> tuple[Float[Array, "K n"], Proposal]:
         """The next points to evaluate, not yet within the bounds, and what the model says of them.
 
-        `samples` are standard normal, and belong to the round.
+        `draw` makes the samples of the round, which are standard normal.
         """
         sigma = params.sigma
         count, size = sizes.step, self.history.residuals.shape[1]
-        n, dtype = len(sigma), samples.dtype
+        n, dtype = len(sigma), sigma.dtype
         slot = jnp.arange(count, dtype=jnp.int32)
         nothing = Proposal(
             steps=jnp.zeros((count, n), dtype),
@@ -131,7 +132,9 @@ class ResidualSearch(eqx.Module):
             units = jnp.eye(n, dtype=dtype)
             if low is not None and high is not None:
                 units = jnp.where(((high >= 1) | (high >= -low))[:, None], units, -units)
-            table = jnp.concatenate([jnp.zeros((1, n), dtype), units, samples])
+            table = jnp.concatenate([jnp.zeros((1, n), dtype), units])
+            if count > 1:
+                table = jnp.concatenate([table, draw()])
             at = jnp.minimum(self.evaluated + slot, len(table) - 1)
             return self.start[None] + sigma[None] * table[at], nothing
 
@@ -142,7 +145,7 @@ class ResidualSearch(eqx.Module):
             return center[None] + sigma[None] * proposal.steps, proposal
 
         def wide() -> tuple[Array, Proposal]:
-            wide = self.wide
+            wide, samples = self.wide, draw()
             at = wide.taken + slot
             width = sigma * wide.scale
             points = (

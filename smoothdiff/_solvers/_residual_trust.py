@@ -132,12 +132,13 @@ class TrustRegion(eqx.Module):
         weight = jnp.where(used, 1 / (1 + (far / _REACH) ** 4), 0)
         a = jnp.where(used[:, None], away[near], 0) / width
         change = jnp.where(used[:, None], history.residuals[near] - row[None], 0)
-        normal = dot((a * weight[:, None]).T, a)
-        ridge = _RIDGE * jnp.trace(normal) / n + tiny
-        size = jnp.arange(n)
+        # by singular values, since squares of them would take half of the digits
+        root = jnp.sqrt(weight)
+        left, values, right = jnp.linalg.svd(a * root[:, None], full_matrices=False)
+        ridge = _RIDGE * jnp.sum(values**2) / n + tiny
+        inverse = dot(right.T, (values / (values**2 + ridge))[:, None] * (left * root[:, None]).T)
         old = self.jacobian * width
-        side = dot((a * weight[:, None]).T, change - dot(a, old))
-        correction = jnp.linalg.solve(normal.at[size, size].add(ridge), side)
+        correction = dot(inverse, change - dot(a, old))
         new = jnp.where(jnp.all(jnp.isfinite(correction)), old + correction, old)
         jacobian = jnp.asarray(new) / width
         close = far <= _FARTHEST * jnp.maximum(self.radius / width, 0.05)

@@ -1,0 +1,151 @@
+"""The local model of residuals: its step within a region, its fit, what it makes of an outcome."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.optimize
+
+from smoothdiff._solvers._bounded_step import bounded_step
+from smoothdiff._solvers._residual_history import History
+from smoothdiff._solvers._residual_trust import Proposal, TrustRegion
+
+STEP = jax.jit(bounded_step)
+NONE = None, None
+
+
+def quadratic(seed, n=4, shift=0.0):
+    """A random Hessian, with eigenvalues that `shift` may make negative, and a gradient."""
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(n, n))
+    return root @ root.T - shift * np.eye(n), rng.normal(size=n)
+
+
+def value(hessian, grad, p):
+    return grad @ p + p @ hessian @ p / 2
+
+
+@pytest.mark.parametrize("shift", [0.0, 3.0])
+def test_the_step_is_the_minimiser_within_the_radius(shift, x64):
+    """More and Sorensen: (H + s I) p = -g with H + s I positive, s >= 0, s (|p| - r) = 0."""
+    for seed in range(5):
+        hessian, grad = quadratic(seed, shift=shift)
+        for radius in (0.01, 0.3, 100.0):
+            p = np.asarray(STEP(hessian, grad, jnp.asarray(radius), *NONE))
+            assert np.linalg.norm(p) <= radius * (1 + 1e-6)
+            slope = hessian @ p + grad
+            multiplier = -slope @ p / (p @ p)
+            np.testing.assert_allclose(
+                slope, -multiplier * p, atol=1e-5 * float(np.linalg.norm(grad))
+            )
+            assert multiplier >= max(0, -np.linalg.eigvalsh(hessian)[0]) - 1e-6
+            assert multiplier * (radius - np.linalg.norm(p)) < 1e-4 * radius
+
+
+def test_bounds_hold_and_little_is_lost_to_them(x64):
+    low, high = -0.2 * np.ones(4), np.array([0.1, 0.3, 0.05, 0.2])
+    for seed in range(5):
+        hessian, grad = quadratic(seed)
+        p = np.asarray(STEP(hessian, grad, jnp.asarray(10.0), low, high))
+        assert np.all((p >= low) & (p <= high))
+        best = scipy.optimize.minimize(
+            lambda q, h=hessian, g=grad: value(h, g, q),
+            np.zeros(4),
+            bounds=list(zip(low, high, strict=True)),
+        )
+        assert value(hessian, grad, p) < 0.99 * best.fun
+
+
+@pytest.mark.parametrize("factor", [1e-30, 1.0, 1e15])
+def test_a_step_is_finite_whatever_the_scale(factor):
+    hessian, grad = (np.float32(factor * part) for part in quadratic(0))
+    p = np.asarray(STEP(hessian, grad, np.float32(0.3), *NONE))
+    assert np.all(np.isfinite(p))
+    assert np.linalg.norm(p) == pytest.approx(0.3, rel=1e-3)
+    flat = np.asarray(STEP(0 * hessian, 0 * grad, np.float32(0.3), *NONE))
+    assert np.all(np.isfinite(flat))
+
+
+JACOBIAN = np.random.default_rng(3).normal(size=(3, 7))
+
+
+def known(points):
+    """A history of the linear residuals 1 + y J at these points."""
+    points = jnp.asarray(points)
+    rows = 1 + points @ jnp.asarray(JACOBIAN)
+    empty = History.empty(12, 3, 7, points.dtype)
+    return empty.after(points, rows, jnp.ones(len(points), bool), jnp.asarray(len(points)))
+
+
+def propose(trust, history):
+    center, row = history.best(jnp.zeros(3))
+    proposal = trust.propose(history, center, row, jnp.ones(3), NONE, 1)
+    return proposal, center, row
+
+
+def test_n_plus_one_points_give_the_jacobian_of_a_linear_function(x64):
+    history = known(np.concatenate([np.zeros((1, 3)), np.eye(3)]))
+    proposal, *_ = propose(TrustRegion.start(jnp.asarray(1.0), 3, 7), history)
+    np.testing.assert_allclose(proposal.jacobian, JACOBIAN, atol=1e-6)
+    assert not proposal.poor
+
+
+def test_directions_that_no_point_has_keep_the_old_jacobian(x64):
+    history = known([[0, 0, 0], [1.0, 0, 0]])
+    old = np.ones((3, 7))
+    trust = TrustRegion.start(jnp.asarray(1.0), 3, 7)
+    trust = TrustRegion(trust.radius, jnp.asarray(old), *jax.tree.leaves(trust)[2:])
+    proposal, *_ = propose(trust, history)
+    np.testing.assert_allclose(proposal.jacobian[0], JACOBIAN[0], atol=1e-6)
+    np.testing.assert_allclose(proposal.jacobian[1:], old[1:], atol=1e-6)
+    assert proposal.poor
+
+
+def outcome(fun, trust=None, predicted=0.5):
+    """The region after a step of length one from 1, where half of that was predicted."""
+    one = jnp.ones((1, 1))
+    proposal = Proposal(
+        steps=one,
+        predicted=predicted * one,
+        promised=(1 - predicted**2) / 2 * jnp.ones(1),
+        slope=jnp.ones(1),
+        jacobian=one,
+        poor=jnp.asarray(False),
+    )
+    trust = trust or TrustRegion.start(jnp.asarray(1.0), 1, 1)
+    row = jnp.full((1, 1), fun)
+    return trust.revise(proposal, jnp.ones(1), row, jnp.isfinite(row[:, 0]))
+
+
+def test_the_radius_follows_the_acceptance_ratio():
+    assert outcome(0.5).radius == 2  # as predicted
+    assert outcome(0.9).radius == 1  # lower, but by less
+    assert 0.1 <= outcome(1.2).radius <= 0.5  # higher
+    assert outcome(50.0).radius == pytest.approx(0.1)
+    for anything in (jnp.nan, jnp.inf):
+        assert outcome(anything).radius == pytest.approx(0.1)
+
+
+def test_steps_that_change_nothing_or_are_predicted_no_better_are_rough():
+    assert outcome(1.0).failed()
+    smooth = outcome(1.2)
+    assert not smooth.failed()
+    again = outcome(1.2, smooth)
+    assert again.fails == 2
+    # what has worked before is given more time
+    worked = outcome(0.5)
+    assert not outcome(1.0, worked).failed()
+
+
+def test_the_best_point_stays_in_the_history(x64):
+    history = known([[0.0, 0, 0]])
+    best = jnp.asarray([[0.5, 0.5, 0.5]])
+    history = history.after(best, jnp.zeros((1, 7)), jnp.ones(1, bool), jnp.asarray(1))
+    for i in range(40):
+        point = jnp.full((1, 3), float(i))
+        rows = jnp.full((1, 7), 1.0 + i)
+        history = history.after(point, rows, jnp.ones(1, bool), jnp.asarray(1))
+    point, row = history.best(jnp.zeros(3))
+    np.testing.assert_array_equal(point, best[0])
+    np.testing.assert_array_equal(row, np.zeros(7))
+    assert history.points[-1, 0] == 39
