@@ -40,7 +40,7 @@ SLOW = {
     "first_order": (600, 1e-2, 8),
     "zerograds": (600, 1e-2, 2),
     "newton_cg": (200, 1e-6, 6),
-    "gauss_newton": (60, 1e-6, 6),
+    "gauss_newton": (60, 1e-6, 1),
     "optax_perturbations": (600, 1e-2, 4),
     # the slope that sets the unit, then the value and the gradient of the first step
     "optimistix_bfgs": (200, 1e-6, 4 + 1 + 4),

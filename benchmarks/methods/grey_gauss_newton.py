@@ -32,6 +32,7 @@ import optax
 
 import smoothdiff as sd
 from benchmarks._task import Grey, Key, MethodEntry, NotAble, Problem, Solve, Y
+from smoothdiff._solvers import _batch_by_batch
 
 CASES = 32  # whose solvers take a step at a time
 LESSONS = 16, 240  # steps of Adam after the first time, and after the last one
@@ -72,6 +73,7 @@ class Solvers:
     def __init__(self, grey: Grey, answer: jax.Array):
         samples = 4 + int(3 * math.log(answer.size))
         self._grey, self._samples = grey, samples
+        # by batches whatever the number of parameters: cases step together under vmap
         self._solver = sd.GaussNewton(grey.sigma, num_samples=samples, history=2 * samples)
         self._function = lambda x, picture: (grey.render(x) - picture, None)
         self._picture = jax.eval_shape(grey.render, answer)
@@ -83,8 +85,8 @@ class Solvers:
 
     def begin(self, key: Key, said: jax.Array) -> tuple[Known, Rendered]:
         """What is known when the network has said this of the cases, and no render yet."""
-        rest = {"key": key}, self._picture, None, frozenset()
-        begin = lambda x: self._solver.init(self._function, x, None, *rest)
+        size = math.prod(self._picture.shape)
+        begin = lambda x: _batch_by_batch.init(self._solver, x, {"key": key}, size)
         known = Known(said, jnp.full(len(said), jnp.inf), said, jax.vmap(begin)(said))
         nothing = (jnp.full((KEPT, *a.shape), jnp.nan, a.dtype) for a in (said[0], self._picture))
         return known, Rendered(*nothing)
@@ -126,8 +128,8 @@ class Solvers:
         scale = state.search.scale
         scale = jnp.clip(jump, scale, jnp.maximum(scale, 1))
         state = eqx.tree_at(lambda state: state.search.scale, state, scale)
-        rest = picture, {"key": key}, state, frozenset()
-        at, state, _ = self._solver.step(self._function, start, *rest)
+        rest = picture, {"key": key}, state
+        at, state, _ = _batch_by_batch.step(self._solver, self._function, start, *rest)
         history = state.search.history
         last = slice(-self._samples, None)
         seen: jax.Array = history.residuals[last].reshape(-1, *picture.shape) + picture[None]
