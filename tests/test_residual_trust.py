@@ -56,6 +56,14 @@ def test_bounds_hold_and_little_is_lost_to_them(x64):
         assert value(hessian, grad, p) < 0.99 * best.fun
 
 
+def test_bounds_that_are_far_away_change_nothing(x64):
+    for seed in range(5):
+        hessian, grad = quadratic(seed)
+        radius, far = jnp.asarray(0.3), 10 * np.ones(4)
+        free = STEP(hessian, grad, radius, *NONE)
+        np.testing.assert_allclose(STEP(hessian, grad, radius, -far, far), free, rtol=1e-6)
+
+
 @pytest.mark.parametrize("factor", [1e-30, 1.0, 1e15])
 def test_a_step_is_finite_whatever_the_scale(factor):
     hessian, grad = (np.float32(factor * part) for part in quadratic(0))

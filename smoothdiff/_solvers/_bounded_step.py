@@ -31,25 +31,27 @@ def bounded_step(
     everything = jnp.ones(grad.shape, bool)
     if low is None or high is None:
         return _within(hessian, grad, radius, everything)
-    low, high = jnp.maximum(low, -radius), jnp.minimum(high, radius)
+    near, far = jnp.maximum(low, -radius), jnp.minimum(high, radius)
     shares = jnp.asarray(_SHARES, grad.dtype)
 
     def again(carry: tuple) -> tuple:
         p: Array
         p, value, _, times = carry
         slope = grad + dot(hessian, p)
-        free = ~(((p <= low) & (slope > 0)) | ((p >= high) & (slope < 0)))
+        free = ~(((p <= near) & (slope > 0)) | ((p >= far) & (slope < 0)))
         step = _within(hessian, slope, radius, free)
-        room = jnp.where(step > 0, high - p, low - p)
+        crossed = jnp.any((p + step < low) | (p + step > high))
+        room = jnp.where(step > 0, far - p, near - p)
         moves = step != 0
         first = jnp.min(jnp.where(moves, room / jnp.where(moves, step, 1), jnp.inf))
         tried = jnp.append(shares, jnp.minimum(first, 1))
-        ends = jnp.clip(p[None] + tried[:, None] * step[None], low[None], high[None])
+        ends = jnp.clip(p[None] + tried[:, None] * step[None], near[None], far[None])
         values = dot(ends, grad) + jnp.sum(dot(ends, hessian) * ends, axis=1) / 2
         best = jnp.argmin(values)
         lower = values[best] < value
         p = jnp.where(lower, ends[best], p)
-        return p, jnp.minimum(values[best], value), lower, times + 1
+        # without a bound in the way the step is the minimiser
+        return p, jnp.minimum(values[best], value), lower & crossed, times + 1
 
     going = lambda carry: carry[2] & (carry[3] < _TIMES)
     start = jnp.zeros_like(grad), jnp.zeros_like(radius), jnp.asarray(True), 0
