@@ -152,7 +152,8 @@ def test_the_best_point_stays_in_the_history(x64):
     for i in range(40):
         point = jnp.full((1, 3), float(i))
         rows = jnp.full((1, 7), 1.0 + i)
-        history = history.after(point, rows, jnp.ones(1, bool), jnp.asarray(1))
+        room = history.keeping_best(1)
+        history = room.after(point, rows, jnp.ones(1, bool), jnp.asarray(1))
     point, row = history.best(jnp.zeros(3))
     np.testing.assert_array_equal(point, best[0])
     np.testing.assert_array_equal(row, np.zeros(7))

@@ -32,7 +32,7 @@ from smoothdiff._solvers._residual_batch import (
 )
 from smoothdiff._solvers._residual_history import History
 from smoothdiff._solvers._restarts import Restarts
-from smoothdiff._solvers._wide_rounds import LONGEST, next_scale, sides_of
+from smoothdiff._solvers._wide_rounds import LONGEST, further, next_scale, sides_of
 
 # evaluations a step of a problem with many parameters
 _MOST = 96
@@ -89,9 +89,9 @@ def _batch(
     points = jnp.concatenate([params.theta[None], _points(solver, params, key, sigma, first - 1)])
     drawn = jnp.ones(first, bool)
     if not tried:
-        step, worth = search.further(sigma)
-        further = params.clip(params.theta + step)
-        points = kept(points.at[1].set(jnp.where(worth, further, points[1])))
+        step, worth = further(search.move, sigma)
+        beyond = params.clip(params.theta + step)
+        points = kept(points.at[1].set(jnp.where(worth, beyond, points[1])))
         drawn = drawn.at[1].set(~worth)
 
     def evaluate(count: int) -> tuple[Array, PyTree]:

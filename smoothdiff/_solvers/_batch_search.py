@@ -6,8 +6,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._solvers._residual_history import History
 
-# a step is tried so many times as far, where that is at least sigma
-_FURTHER = 5.0
 # so many small steps in a row count as convergence
 _SMALL = 3
 
@@ -54,11 +52,6 @@ class BatchSearch(eqx.Module):
             jnp.where(fun < self.lowest, 0, self.stale + 1),
             jnp.where(small, self.small + 1, 0),
         )
-
-    def further(self, sigma: Float[Array, " n"]) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
-        """A step on in the direction of the last one, and whether it is worth an evaluation."""
-        step = _FURTHER * self.move
-        return step, jnp.mean((step / sigma) ** 2) > 1
 
     def converged(self) -> Bool[Array, ""]:
         """Whether the last steps were small."""

@@ -31,16 +31,19 @@ class History(eqx.Module):
         valid: Bool[Array, " m"],
         count: Int[Array, ""],
     ) -> "History":
-        """With the first `count` of these rows in place of as many of the oldest, but the best."""
-        best = self._best()
-        place = jnp.where(best < count, count, best) % len(self.valid)
-        safe = jax.tree.map(lambda a: a.at[place].set(a[best]), self)
+        """With the first `count` of these rows in place of as many of the oldest."""
 
         def latest(old: Array, new: Array) -> Array:
             return jax.lax.dynamic_slice_in_dim(jnp.concatenate([old, new]), count, len(old))
 
         new = History(points, residuals, valid)
-        return jax.tree.map(latest, safe, new)
+        return jax.tree.map(latest, self, new)
+
+    def keeping_best(self, count: int) -> "History":
+        """The best row is not among the `count` oldest, which come to make way."""
+        best = self._best()
+        place = jnp.where(best < count, count, best) % len(self.valid)
+        return jax.tree.map(lambda a: a.at[place].set(a[best]), self)
 
     def best(self, start: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " P"]]:
         """The point with the smallest sum of squares, and its row; at first the start, and zeros.

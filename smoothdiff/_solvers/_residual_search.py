@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from smoothdiff._params import Params
 from smoothdiff._solvers._residual_history import History
 from smoothdiff._solvers._residual_trust import Proposal, TrustRegion
-from smoothdiff._solvers._wide_rounds import Wide, sides_of
+from smoothdiff._solvers._wide_rounds import Wide, further, sides_of
 
 # what is evaluated next
 FIRST, TRUST, WIDE = 0, 1, 2
@@ -151,7 +151,7 @@ class ResidualSearch(eqx.Module):
             points = (
                 wide.center[None] + width[None] * samples[jnp.clip(at - 1, 0, len(samples) - 1)]
             )
-            step, worth = wide.further(width)
+            step, worth = further(wide.move, width)
             points = jnp.where(((at == 1) & worth)[:, None], (wide.center + step)[None], points)
             return jnp.where((at == 0)[:, None], wide.center[None], points), nothing
 
@@ -167,11 +167,12 @@ class ResidualSearch(eqx.Module):
         sizes: Sizes,
     ) -> "ResidualSearch":
         """The search with these residuals at these points."""
-        kept = self.history.after(points, rows, good, jnp.asarray(sizes.step))
+        room = self.history.keeping_best(sizes.step)
+        kept = room.after(points, rows, good, jnp.asarray(sizes.step))
         here = self.history.best(self.start)
         with_rows = eqx.tree_at(lambda s: s.history, self, kept)
         by_stage = [
-            lambda: with_rows._after_first(rows, good, sizes),
+            lambda: with_rows._after_first(sizes),
             lambda: with_rows._after_local(here[1], rows, good, proposal),
             lambda: with_rows._after_wide(params, rows, good, sizes),
         ]
@@ -187,7 +188,7 @@ class ResidualSearch(eqx.Module):
         stage = jnp.full_like(self.stage, WIDE)
         return eqx.tree_at(lambda s: (s.stage, s.wide), self, (stage, wide))
 
-    def _after_first(self, rows: Array, good: Array, sizes: Sizes) -> "ResidualSearch":
+    def _after_first(self, sizes: Sizes) -> "ResidualSearch":
         enough = self.evaluated + sizes.step > len(self.start)
         stage = jnp.where(enough, TRUST, FIRST).astype(self.stage.dtype)
         known = eqx.tree_at(lambda s: s.stage, self, stage)

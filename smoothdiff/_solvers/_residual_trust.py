@@ -29,6 +29,8 @@ _FAILED, _HELD = 0.1, 0.7
 _PREDICTED = 0.5
 # a direction with less than this share of the radius is not covered by evaluations
 _COVERED = 0.2
+# ... and evaluations cover the region, or this share of what the fit uses
+_CLOSE = 0.05
 # the radius after a failure, in lengths of the step
 _SMALLEST, _LARGEST = 0.1, 0.5
 # so many steps in a row that fail, or fail and are rough, are too many; of the latter one, where no
@@ -36,8 +38,9 @@ _SMALLEST, _LARGEST = 0.1, 0.5
 _FAILS, _ROUGH = 8, 2
 # ... and so many evaluations for each parameter that lower the loss by less than this share
 _SLOW, _LITTLE = 3, 0.01
-# a shorter step should lower the error of the prediction by this factor, or the function is rough
-_SMOOTH = 0.8
+# a step shorter by the first factor should lower the error of the prediction below the second one,
+# or the function is rough
+_SHORTER, _SMOOTH = 0.6, 0.8
 
 
 class Proposal(NamedTuple):
@@ -141,7 +144,7 @@ class TrustRegion(eqx.Module):
         correction = dot(inverse, change - dot(a, old))
         new = jnp.where(jnp.all(jnp.isfinite(correction)), old + correction, old)
         jacobian = jnp.asarray(new) / width
-        close = far <= _FARTHEST * jnp.maximum(self.radius / width, 0.05)
+        close = far <= _FARTHEST * jnp.maximum(self.radius / width, _CLOSE)
         covered, directions = jnp.linalg.eigh(dot(jnp.where(close[:, None], a, 0).T, a))
         least = jnp.sqrt(jnp.maximum(covered[0], 0))
         return jacobian, directions[:, 0], least < _COVERED * self.radius / width
@@ -165,7 +168,7 @@ class TrustRegion(eqx.Module):
         tried = promised > 0
         failed = tried & ~(ratio > _FAILED)
         fails = jnp.where(failed, self.fails + 1, jnp.where(tried, 0, self.fails))
-        shorter = (self.fails > 0) & (length < 0.6 * self.length)
+        shorter = (self.fails > 0) & (length < _SHORTER * self.length)
         more = same | (shorter & (error >= _SMOOTH * self.error))
         rough = jnp.where(more, self.rough + 1, self.rough)
         rough = jnp.asarray(jnp.where(failed, rough, jnp.where(tried, 0, self.rough)))

@@ -48,11 +48,6 @@ class Wide(eqx.Module):
         no = jnp.asarray(False)
         return Wide(center, row, still, scale, before, none, none, none, none, no, no)
 
-    def further(self, sigma: Float[Array, " n"]) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
-        """A step on in the direction of the last one, and whether it is worth an evaluation."""
-        step = _FURTHER * self.move
-        return step, jnp.mean((step / sigma) ** 2) > 1
-
     def stepped(self, history: History, params: Params, count: Array) -> "Wide":
         """The regression over the round and what was before it; the next round."""
         sigma = params.sigma * self.scale
@@ -83,6 +78,14 @@ class Wide(eqx.Module):
             found=self.found,
             seen=~same,
         )
+
+
+def further(
+    move: Float[Array, " n"], sigma: Float[Array, " n"]
+) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
+    """A step on in the direction of the last one, and whether it is worth an evaluation."""
+    step = _FURTHER * move
+    return step, jnp.mean((step / sigma) ** 2) > 1
 
 
 def sides_of(
