@@ -25,7 +25,17 @@ COMMITTED = HERE / "results"  # what the tables of the README were made from
 RUNS = HERE / "runs"  # what a user runs; git ignores it
 PACKAGES = (
     *("smoothdiff", "jax", "jaxlib", "optax", "optimistix", "equinox", "lineax", "numpy", "scipy"),
-    *("mitsuba", "coco-experiment", "cma", "evosax", "jaxopt", "Py-BOBYQA", "pygad"),
+    *(
+        "mitsuba",
+        "coco-experiment",
+        "cma",
+        "evosax",
+        "jaxopt",
+        "Py-BOBYQA",
+        "pygad",
+        "DFO-LS",
+        "sif2jax",
+    ),
 )
 
 

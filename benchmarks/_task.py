@@ -5,7 +5,7 @@ where it is after each iteration and is stopped by it.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Literal, NamedTuple, TypeAlias
@@ -237,15 +237,20 @@ class MethodEntry(NamedTuple):
     prepare: Callable[[Problem], Solve]
 
 
+def precision_of(task: Task) -> AbstractContextManager[None]:
+    """Inside, JAX has the precision of the task."""
+    return precision(task.precision)
+
+
 @contextmanager
-def precision_of(task: Task) -> Iterator[None]:
-    """Inside, JAX has the precision of the task.
+def precision(name: Literal["float32", "float64"]) -> Iterator[None]:
+    """Inside, JAX has this precision.
 
     For the whole process: `with jax.enable_x64(True)` is for one thread, and callbacks run in
     threads of JAX's, where float64 would become float32.
     """
     before = jax.config.read("jax_enable_x64")
-    jax.config.update("jax_enable_x64", task.precision == "float64")
+    jax.config.update("jax_enable_x64", name == "float64")
     try:
         yield
     finally:

@@ -1,0 +1,64 @@
+"""Ours: `GaussNewton` on residuals, `NewtonCG` on numbers, both through a black box.
+
+There is one black box for all functions of a shape, so that a solver is compiled once for each.
+"""
+
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import smoothdiff as sd
+from benchmarks.studies.profiles.runs import SEED, Method, Seen, Spent
+
+ENDLESS = 2**31 - 1  # steps: what ends a run is the budget
+LIBRARY = Path(sd.__file__).parent
+FILES = (Path(__file__), LIBRARY / "_run.py", *sorted(LIBRARY.glob("_solvers/*.py")))
+SOURCE = "".join(path.read_text() for path in FILES)
+
+
+def gauss_newton(seen: Seen) -> None:
+    solver = sd.GaussNewton(jnp.asarray(seen.case.width), nonfinite="drop")
+    _run(sd.least_squares, seen, solver)
+
+
+def newton_cg(seen: Seen) -> None:
+    solver = sd.NewtonCG(jnp.asarray(seen.case.width), nonfinite="drop", restarts=100)
+    _run(sd.minimise, seen, solver)
+
+
+@cache
+def _black_box(shape: tuple[int, ...]) -> SimpleNamespace:
+    """Whatever is `current` as a function of JAX, and that is the same object for all of them."""
+    box = SimpleNamespace(current=None)
+
+    def call(x: np.ndarray) -> Any:
+        return box.current(x)
+
+    black = sd.black_box(call, jax.ShapeDtypeStruct(shape, np.float64), on_nonfinite="nan")
+    box.fun = lambda y, args: black(y)
+    return box
+
+
+def _run(minimise: Any, seen: Seen, solver: Any) -> None:
+    box, start = _black_box(seen.at_start.shape), jnp.asarray(seen.case.start)
+    box.current = seen
+    options = {"key": jax.random.key(SEED), "bounds": seen.case.bounds, "max_steps": ENDLESS}
+    try:
+        result = minimise(box.fun, start, solver=solver, **options)
+    except sd.MinimiseError:
+        if seen.count < seen.budget:
+            raise
+        raise Spent from None
+    if result.reason == "interrupted":
+        raise KeyboardInterrupt
+
+
+METHODS = {
+    "gauss_newton": Method("Gauss-Newton (ours)", True, gauss_newton, SOURCE),
+    "newton_cg": Method("Newton-CG (ours)", False, newton_cg, SOURCE),
+}

@@ -1,0 +1,98 @@
+"""Those of other libraries, with their defaults; the first width and bounds are the problem's."""
+
+from functools import partial
+from inspect import getsource
+from itertools import chain
+from typing import Any
+
+import numpy as np
+from scipy import optimize
+
+from benchmarks.methods._flat import package
+from benchmarks.studies.profiles.runs import SEED, Method, Seen
+
+
+def dfo_ls(seen: Seen, noise: bool) -> None:
+    """Told, or not, that there is noise: then it restarts."""
+    dfols, case = package("dfols", "DFO-LS"), seen.case
+    options: dict[str, Any] = {"bounds": case.bounds, "objfun_has_noise": noise}
+    dfols.solve(
+        seen, case.start, rhobeg=case.width, maxfun=seen.budget, do_logging=False, **options
+    )
+
+
+def differences(seen: Seen) -> None:
+    """Two-point ones, for a trust-region Gauss-Newton."""
+    optimize.least_squares(seen, seen.case.start)
+
+
+def py_bobyqa(seen: Seen) -> None:
+    """Told that there is noise where there is."""
+    pybobyqa, case = package("pybobyqa", "Py-BOBYQA"), seen.case
+    options: dict[str, Any] = {"bounds": case.bounds, "objfun_has_noise": case.kind.noisy}
+    pybobyqa.solve(
+        seen, case.start, rhobeg=case.width, maxfun=seen.budget, do_logging=False, **options
+    )
+
+
+def cobyqa(seen: Seen) -> None:
+    options = {"initial_tr_radius": seen.case.width, "maxfev": seen.budget}
+    _scipy(seen, "COBYQA", bounds=_pairs(seen), options=options)
+
+
+def bfgs(seen: Seen) -> None:
+    """On its own differences; it knows no bounds."""
+    _scipy(seen, "BFGS", options={"maxiter": seen.budget})
+
+
+def nelder_mead(seen: Seen) -> None:
+    """The first simplex has edges of the width, into the box."""
+    case = seen.case
+    high = np.inf if case.bounds is None else case.bounds[1]
+    edges = np.diag(np.where(case.start + case.width <= high, case.width, -case.width))
+    options = {
+        "initial_simplex": np.vstack([case.start, case.start + edges]),
+        "maxiter": seen.budget,
+        "maxfev": seen.budget,
+    }
+    _scipy(seen, "Nelder-Mead", bounds=_pairs(seen), options=options)
+
+
+def bipop_cma_es(seen: Seen) -> None:
+    """Restarts begin anywhere in the box, or without one at the start."""
+    cma, case = package("cma", "cma"), seen.case
+    options: dict[str, Any] = {"maxfevals": seen.budget, "seed": SEED + 1, "verbose": -9}
+    if case.start.size == 1:  # pycma 4 raises where it would cut the width in 1-D
+        options["maxstd"] = np.inf
+    start: Any = case.start
+    if case.bounds is not None:
+        options["bounds"] = list(case.bounds)
+        (low, high), random = case.bounds, np.random.default_rng(SEED)
+        starts = chain([case.start], iter(lambda: random.uniform(low, high), None))
+        start = lambda: next(starts)
+    cma.fmin2(seen, start, case.width, options, restarts=9, bipop=True)
+
+
+def _scipy(seen: Seen, method: str, **how: Any) -> None:
+    optimize.minimize(seen, seen.case.start, method=method, **how)
+
+
+def _pairs(seen: Seen) -> np.ndarray | None:
+    return None if seen.case.bounds is None else np.transpose(seen.case.bounds)
+
+
+def _method(title: str, search: Any, residuals: bool = False) -> Method:
+    function = search.func if isinstance(search, partial) else search
+    return Method(title, residuals, search, getsource(function) + getsource(_scipy))
+
+
+METHODS = {
+    "dfo_ls": _method("DFO-LS", partial(dfo_ls, noise=False), residuals=True),
+    "dfo_ls_noise": _method("DFO-LS, told of noise", partial(dfo_ls, noise=True), residuals=True),
+    "least_squares": _method("least_squares (SciPy)", differences, residuals=True),
+    "py_bobyqa": _method("Py-BOBYQA", py_bobyqa),
+    "cobyqa": _method("COBYQA (SciPy)", cobyqa),
+    "bfgs": _method("BFGS (SciPy)", bfgs),
+    "nelder_mead": _method("Nelder-Mead (SciPy)", nelder_mead),
+    "bipop_cma_es": _method("BIPOP-CMA-ES (pycma)", bipop_cma_es),
+}

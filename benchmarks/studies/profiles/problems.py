@@ -1,0 +1,168 @@
+"""The problems: CUTEst's as sif2jax has them, with residuals and without, and COCO's BBOB.
+
+N. I. M. Gould, D. Orban, Ph. L. Toint: CUTEst: a Constrained and Unconstrained Testing
+Environment with Safe Threads. Computational Optimization and Applications 60 (2015).
+N. Hansen, S. Finck, R. Ros, A. Auger: Real-Parameter Black-Box Optimization Benchmarking 2009:
+Noiseless Functions Definitions. INRIA RR-6829.
+"""
+
+import sys
+from collections.abc import Callable, Iterator
+from functools import cache
+from itertools import product
+from types import ModuleType, SimpleNamespace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.methods._flat import package
+from benchmarks.studies.profiles.kinds import CLEAN, RESIDUALS, SCALARS, Kind
+
+FIRST, LAST = "A", "L"  # letters that names begin with
+MOST_RESIDUALS = 500
+STRIDE, SMALL = 10, 5  # quick: every tenth of those with up to five parameters
+WIDTH, BOX_WIDTH = 0.1, 2.0  # where to begin: as a share of the largest parameter; in BBOB's box
+BOX = 5.0  # of BBOB, to both sides
+TARGETS = tuple(np.geomspace(1e2, 1e-8, 51))  # above the lowest value
+# by name, what only the other problems of sif2jax need and what takes a minute to import
+SLOW = {"sif2jax.cutest._constrained_minimisation.cleuven7": SimpleNamespace(CLEUVEN7=object)}
+
+
+class Case(NamedTuple):
+    """A function and where to begin; residuals are an array, other values have no axis.
+
+    `lowest` is the lowest value, or None where that is not known.
+    """
+
+    name: str
+    fun: Callable[[np.ndarray], Any]
+    start: np.ndarray
+    width: float
+    bounds: tuple[np.ndarray, np.ndarray] | None = None
+    lowest: float | None = None
+    kind: Kind = CLEAN
+
+
+class Panel(NamedTuple):
+    """Cases that are counted together. A budget is a number of units, each `n + more` evaluations.
+
+    With targets, the pairs of a case and a target are counted.
+    """
+
+    set: str
+    title: str
+    cases: list[Case]
+    budgets: tuple[int, ...]  # where shares are read; the last ends a run
+    more: int = 1
+    targets: tuple[float, ...] = ()
+
+    def evaluations(self, case: Case, budget: int = 1) -> int:
+        return budget * (case.start.size + self.more)
+
+
+def residuals(full: bool) -> Iterator[Panel]:
+    """Least squares: up to 20 parameters and 500 residuals, no fewer than parameters."""
+    cases, budgets = _with_residuals(full), (5, 10, 20, 30) if full else (5, 10, 20)
+    for kind in RESIDUALS:
+        seen = [case._replace(kind=kind) for case in cases]
+        yield Panel("residuals", f"Residuals, {kind.title}", seen, budgets)
+
+
+def scalars(full: bool) -> Iterator[Panel]:
+    """Numbers: up to 50 parameters; and sums of absolute residuals, which have kinks."""
+    cases, budgets = _numbers(full), (10, 50, 200, 500) if full else (10, 30, 100)
+    for kind in SCALARS:
+        seen = [case._replace(kind=kind) for case in cases]
+        yield Panel("scalars", f"Scalars, {kind.title}", seen, budgets)
+    kinks = [_absolute(case) for case in _with_residuals(full)]
+    yield Panel("scalars", "Scalars, sums of absolute values", kinks, budgets)
+
+
+def bbob(full: bool) -> Iterator[Panel]:
+    """Each start is drawn within the box."""
+    cocoex = package("cocoex", "coco-experiment")
+    numbers, instances = (range(1, 25), (1, 2, 3)) if full else ((1, 6, 8, 10, 15, 21), (1,))
+    for n in (5, 10, 20) if full else (5,):
+        cases = [_bbob(cocoex, f, n, instance) for f, instance in product(numbers, instances)]
+        budgets = (10, 100, 300, 1000) if full else (10, 100)
+        yield Panel("bbob", f"BBOB, {n}-D", cases, budgets, more=0, targets=TARGETS)
+
+
+def _bbob(cocoex: ModuleType, number: int, n: int, instance: int) -> Case:
+    problem, box = cocoex.BareProblem("bbob", number, n, instance), np.full(n, BOX)
+    best = problem.best_value()
+    start = np.random.default_rng((number, n, instance)).uniform(-BOX, BOX, n)
+    above = lambda x: problem(x) - best
+    return Case(f"f{number}-{n}d-{instance}", above, start, BOX_WIDTH, (-box, box), 0.0)
+
+
+def _absolute(case: Case) -> Case:
+    return case._replace(fun=lambda x: np.sum(np.abs(case.fun(x))))
+
+
+@cache
+def _with_residuals(full: bool) -> list[Case]:
+    def residuals(problem: Any) -> Callable[[jax.Array], jax.Array]:
+        parts = lambda y: map(jnp.ravel, jax.tree.leaves(problem.constraint(y)))
+        return lambda y: jnp.concatenate(list(parts(y)))
+
+    found = _named(_sif2jax().nonlinear_equations_problems, 20 if full else SMALL)
+    funs = {name: (problem, residuals(problem)) for name, problem in found.items()}
+    sizes = {name: jax.eval_shape(fun, problem.y0).size for name, (problem, fun) in funs.items()}
+    # by shape: ours is compiled for each
+    shapes = sorted((np.size(found[name].y0), size, name) for name, size in sizes.items())
+    chosen = [name for n, size, name in shapes if n <= size <= MOST_RESIDUALS][
+        :: 1 if full else STRIDE
+    ]
+    return _cases({name: funs[name] for name in chosen})
+
+
+@cache
+def _numbers(full: bool) -> list[Case]:
+    def value(problem: Any) -> Callable[[jax.Array], jax.Array]:
+        return lambda y: problem.objective(y, problem.args)
+
+    found = _named(_sif2jax().unconstrained_minimisation_problems, 50 if full else SMALL)
+    chosen = sorted(found, key=lambda name: (np.size(found[name].y0), name))[
+        :: 1 if full else STRIDE
+    ]
+    return _cases({name: (found[name], value(found[name])) for name in chosen})
+
+
+def _named(problems: Any, most: int) -> dict[str, Any]:
+    """Those with such a name, and one array of so many parameters at most."""
+    named = {type(problem).__name__: problem for problem in problems}
+    shapes = {
+        name: jax.eval_shape(lambda problem=problem: problem.y0)  # some have millions
+        for name, problem in named.items()
+        if FIRST <= name[0] <= LAST
+    }
+    single = {name: shape for name, shape in shapes.items() if hasattr(shape, "size")}
+    return {name: named[name] for name, shape in single.items() if shape.size <= most}
+
+
+def _cases(funs: dict[str, tuple[Any, Callable]]) -> list[Case]:
+    """Those that are finite where they begin."""
+    cases = []
+    for name, (problem, fun) in funs.items():
+        start, compiled = np.asarray(problem.y0, float), jax.jit(fun)
+        if np.all(np.isfinite(compiled(start))):
+            width = WIDTH * max(1.0, np.max(np.abs(start)))
+            cases.append(Case(name, compiled, start, width))
+    return cases
+
+
+def _sif2jax() -> ModuleType:
+    """The package; imported in the precision in which it is used, as it has constants."""
+    left_out = {} if "sif2jax" in sys.modules else SLOW
+    sys.modules.update(left_out)  # type: ignore[arg-type]
+    try:
+        return package("sif2jax", "sif2jax")
+    finally:
+        for name in left_out:
+            del sys.modules[name]
+
+
+SETS = {"residuals": residuals, "scalars": scalars, "bbob": bbob}
