@@ -25,17 +25,8 @@ COMMITTED = HERE / "results"  # what the tables of the README were made from
 RUNS = HERE / "runs"  # what a user runs; git ignores it
 PACKAGES = (
     *("smoothdiff", "jax", "jaxlib", "optax", "optimistix", "equinox", "lineax", "numpy", "scipy"),
-    *(
-        "mitsuba",
-        "coco-experiment",
-        "cma",
-        "evosax",
-        "jaxopt",
-        "Py-BOBYQA",
-        "pygad",
-        "DFO-LS",
-        "sif2jax",
-    ),
+    *("mitsuba", "coco-experiment", "cma", "evosax", "jaxopt", "Py-BOBYQA", "DFO-LS", "pygad"),
+    "sif2jax",
 )
 
 
