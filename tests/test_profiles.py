@@ -160,9 +160,9 @@ def test_peers_solve_a_toy_within_their_budget(name):
     box = np.full(2, -5.0), np.full(2, 5.0)
     for bounds in (None, box):
         case = (equations() if method.residuals else bowl())._replace(bounds=bounds)
-        run = trace(method, case, 300)
+        run = trace(method, case, 3000)  # enough for restarts
         assert not run["ended"].startswith("failed"), run["ended"]
-        assert run["evaluations"][-1] <= 300
+        assert run["evaluations"][-1] <= 3000
         assert run["values"][-1] < (0.21 if method.residuals else 1e-3)  # the least is 0.2
 
 

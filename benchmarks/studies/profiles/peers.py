@@ -2,7 +2,7 @@
 
 from functools import partial
 from inspect import getsource
-from itertools import chain
+from itertools import chain, count
 from typing import Any
 
 import numpy as np
@@ -68,7 +68,7 @@ def bipop_cma_es(seen: Seen) -> None:
     if case.bounds is not None:
         options["bounds"] = list(case.bounds)
         (low, high), random = case.bounds, np.random.default_rng(SEED)
-        starts = chain([case.start], iter(lambda: random.uniform(low, high), None))
+        starts = chain([case.start], (random.uniform(low, high) for _ in count()))
         start = lambda: next(starts)
     cma.fmin2(seen, start, case.width, options, restarts=9, bipop=True)
 
