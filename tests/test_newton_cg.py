@@ -124,7 +124,6 @@ def solve(problem, y0, target=(0.0, 0.0), *, sigma=0.5, seed=0, dtype: Any = np.
 
 
 SETTINGS = ("num_samples", "nonfinite", "patience", "restarts")
-SEARCHES: dict[str, Any] = {"patience": 8, "restarts": 9}
 
 
 def flat(y):
@@ -143,13 +142,13 @@ few_seeds = pytest.mark.parametrize("seeds", FEW_SEEDS, ids=["few seeds", "more 
 
 
 @few_seeds
-def test_a_quadratic_takes_18_evaluations(seeds, dtype):
+def test_a_quadratic_takes_12_evaluations(seeds, dtype):
     target = (0.5, 0.3)
     for seed in seeds:
         angle = 2 * np.pi * seed / 10
         y0 = target + 2 * np.array([np.cos(angle), np.sin(angle)])
-        result = solve(quadratic, y0, target, sigma=1.0, seed=seed, max_steps=3, dtype=dtype)
-        assert result.history[-1].evaluations == 18
+        result = solve(quadratic, y0, target, sigma=1.0, seed=seed, max_steps=12, dtype=dtype)
+        assert result.history[-1].evaluations == 12
         assert {leaf.dtype for leaf in jax.tree.leaves(result.history[-1].y)} == {dtype}
         assert {leaf.dtype for leaf in jax.tree.leaves(result.y)} == {dtype}
         assert distance(result.history[-1].y, target) < 0.02, seed
@@ -193,22 +192,28 @@ def test_the_negated_gaussian_is_found_from_where_it_is_indefinite(y0, x64):
 def test_a_constant_function_ends_as_noise(dtype):
     result = solve(constant, (1.0, 2.0), max_evaluations=1000, dtype=dtype)
     assert result.reason == "noise"
-    assert len(result.history) == sd.NewtonCG(0.5).patience
-    assert (result.fun, result.smoothed, result.stderr) == (3, 3, 0)
-    np.testing.assert_array_equal(flat(result.y), [1, 2])
-    widths = [record.sigma for record in result.history]
-    assert np.all(np.diff(widths) > 0)
-    assert np.all(np.isfinite(widths))
+    assert result.evaluations < 100
+    assert (result.fun, result.smoothed) == (3, 3)
+    assert np.all(np.isfinite(flat(result.y)))
+    # it looks further and further away
+    assert 10 < result.history[-1].sigma < np.inf
 
 
 @pytest.mark.parametrize("seeds", [6, pytest.param(20, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("problem", "noise"), [(noisy, 0.1), (noisier, 1.0)])
 def test_noise_of_1_and_10_percent_of_the_range(problem, noise, seeds):
     # from (2, 2) to the target the function falls by 8.5
-    run = functools.partial(solve, problem, (2.0, 2.0), (0.5, -0.5))
-    # the search, and not the lowest of the values, which is luck
-    last = lambda seed: run(seed=seed, max_evaluations=400).history[-1].y
-    away = [distance(last(seed), (0.5, -0.5)) for seed in range(seeds)]
+    args = args_of(problem, (0.5, -0.5), np.float32)
+    solver, y0 = sd.NewtonCG(jnp.float32(0.5)), jnp.array([2.0, 2.0])
+
+    # the center of the search, and not the lowest of the values, which is luck
+    @jax.jit
+    def center(seed):
+        options = {"key": jax.random.key(seed)}
+        run = optx.minimise(plane, solver, y0, args, options, max_steps=400, throw=False)
+        return run.state.search.center.theta
+
+    away = [distance(center(seed), (0.5, -0.5)) for seed in range(seeds)]
     # where the function has risen by a tenth of the noise, and by as much as the noise
     assert np.median(away) < np.sqrt(0.1 * noise)
     assert np.max(away) < 1.3 * np.sqrt(noise)
@@ -256,7 +261,7 @@ LOW, HIGH = np.array([-1.0, -2.0], np.float32), np.array([0.5, 2.0], np.float32)
 def test_bounds_hold_at_every_evaluation():
     bounds = (LOW, HIGH)
     result = solve(
-        watched, (0, 0), (1.5, 1.5), max_evaluations=200, bounds=bounds, seed=5, **SEARCHES
+        watched, (0, 0), (1.5, 1.5), max_evaluations=200, bounds=bounds, seed=5, restarts=9
     )
     assert len(EVALUATED) == result.evaluations
     points = np.stack(EVALUATED + [record.y for record in result.history])
@@ -270,58 +275,39 @@ def test_an_optimum_on_a_bound_is_found(corner):
     # at x = 1.5 - 1 the best y is 7.5 / 10; from the corner both would go on
     target, best = ((3.0, 3.0), (0.5, 2.0)) if corner else ((1.5, 0.0), (0.5, 0.75))
     bounds = (LOW, HIGH)
-    result = solve(quadratic, (0, 0), target, max_evaluations=200, bounds=bounds, **SEARCHES)
+    result = solve(quadratic, (0, 0), target, max_evaluations=200, bounds=bounds, restarts=9)
     assert distance(result.y, best) < 0.01
 
 
-def starts(result, y0):
-    """After which of the steps, from 0, another search began."""
-    y0 = np.asarray(y0, np.float32)
-    return [i for i, record in enumerate(result.history) if np.array_equal(record.y, y0)]
-
-
-def test_a_restart_begins_at_the_start_with_the_first_sigma():
-    run = solve(quadratic, (1, 2), bounds=(-50, 50), seed=5, max_steps=500, **SEARCHES)
-    begun = starts(run, (1, 2))
-    assert len(begun) == SEARCHES["restarts"]
+def test_restarts_begin_anywhere_within_the_bounds():
+    settings = {"target": (0.7, 0.3), "bounds": (-50, 50), "seed": 5, "max_evaluations": 3000}
+    one = solve(watched, (1, 2), **settings)
+    alone = np.array(EVALUATED)
+    run = solve(watched, (1, 2), restarts=7, **settings)
+    points = np.array(EVALUATED)
+    assert one.reason in ("converged", "noise")
     assert run.reason in ("converged", "noise")
-    for i in begun:
-        assert run.history[i + 1].sigma == 0.5
-        assert not np.array_equal(run.history[i + 1].y, run.history[0].y)
-    # a patience of eight ends searches early
-    np.testing.assert_allclose(run.y, 0, atol=0.01)
+    # the first search is the same
+    same = len(one.history)
+    np.testing.assert_array_equal(points[:same], alone[:same])
+    assert np.all(np.abs(points) <= 50)
+    # the others begin everywhere, and none of them where the first did
+    quarters = {tuple(np.sign(point)) for point in points[same:] if np.min(np.abs(point)) > 5}
+    assert len(quarters) == 4
+    assert not any(np.array_equal(point, (1, 2)) for point in points[same:-3])
+    np.testing.assert_allclose(run.y, [0.7, 0.3], atol=1e-3)
 
 
 def test_restarts_find_the_deeper_well():
     firsts = []
     for seed in range(4):
-        run = solve(
-            two_wells, (0, 0), sigma=1.0, seed=seed, bounds=(-9, 9), max_steps=400, **SEARCHES
-        )
-        np.testing.assert_allclose(run.y, [2, 0], atol=0.02)
-        # the result is no worse for the search that was going on
-        assert run.fun < 0.01
-        first = run.history[: starts(run, (0, 0))[0]]
-        firsts.append(min(first, key=lambda record: record.fun).y[0])
+        run = functools.partial(solve, two_wells, (-1.5, 0), sigma=0.3, seed=seed, bounds=(-9, 9))
+        result = run(max_evaluations=1500, restarts=9)
+        np.testing.assert_allclose(result.y, [2, 0], atol=0.02)
+        assert result.fun < 0.01
+        firsts.append(run(max_evaluations=1500).y[0])
     # or the test would show nothing
     assert min(firsts) < -1
-
-
-@pytest.mark.slow
-def test_restarts_find_the_deeper_of_two_wells():
-    ends = []
-    for key in jax.random.split(KEY, 8):
-        run = functools.partial(solve, two_wells, (0, 0), sigma=1.0, key=key)
-        one, all_of_them = run(max_steps=300), run(max_steps=900, restarts=8)
-        assert one.reason != "max_steps"
-        ends.append(float(one.y[0]))
-        np.testing.assert_allclose(all_of_them.y, [2, 0], atol=0.02)
-        # until the first search ends nothing is different
-        same = len(one.history) - 1
-        for a, b in zip(one.history[:same], all_of_them.history, strict=False):
-            np.testing.assert_array_equal(a.y, b.y)
-        assert all_of_them.fun < 0.01
-    assert min(ends) < 0
 
 
 # how it runs
@@ -338,7 +324,7 @@ def test_iterates_are_those_of_optimistix_to_the_last_bit():
     for name in ("fun", "smoothed", "stderr", "evaluations"):
         assert getattr(result, name) == solution.stats[name]
     assert solution.result == optx.RESULTS.nonlinear_max_steps_reached
-    assert result.evaluations == 30 * 6 + 5 + 6
+    assert result.evaluations == 30 + 2
 
 
 def test_runs_vmapped_on_vectors_are_single_ones_on_pytrees(x64):
@@ -347,20 +333,19 @@ def test_runs_vmapped_on_vectors_are_single_ones_on_pytrees(x64):
     def final(seed):
         options = {"key": jax.random.key(seed)}
         args = jnp.zeros(2), jnp.asarray(target)
-        run = optx.minimise(quadratic, solver, *args, options, max_steps=3, throw=False)
-        return run.state.search.accepted, run.stats
+        run = optx.minimise(quadratic, solver, *args, options, max_steps=12, throw=False)
+        return run.value, run.stats
 
     many, stats = jax.jit(jax.vmap(final))(jnp.arange(3))
-    for seed, accepted in enumerate(many):
+    for seed, value in enumerate(many):
         run = solve(
-            quadratic, (0.0, 0.0), target, sigma=1.0, seed=seed, max_steps=3, dtype=np.float64
+            quadratic, (0.0, 0.0), target, sigma=1.0, seed=seed, max_steps=12, dtype=np.float64
         )
-        assert stats["evaluations"][seed] == run.evaluations == 3 * 6 + 5 + 6
+        assert stats["evaluations"][seed] == run.evaluations == 12 + 2
         assert stats["fun"][seed] == pytest.approx(run.fun, abs=1e-4)
         assert stats["smoothed"][seed] == pytest.approx(run.smoothed, abs=1e-4)
-        run.history.pop()  # the next step says what was accepted
-        assert run.history[-1].y["b"][0].shape == (1,)
-        np.testing.assert_allclose(accepted, flat(run.history[-1].y), atol=1e-5)
+        assert run.y["b"][0].shape == (1,)
+        np.testing.assert_allclose(value, flat(run.y), atol=1e-5)
 
 
 def test_a_resumed_run_ends_with_the_same_bits(tmp_path):
@@ -369,7 +354,7 @@ def test_a_resumed_run_ends_with_the_same_bits(tmp_path):
     run(max_steps=8, checkpoint=path)
     resumed = run(max_steps=20, checkpoint=path)
     np.testing.assert_array_equal(resumed.y, whole.y)
-    pick = lambda record: (record.step, record.evaluations, record.fun, record.stderr, record.sigma)
+    pick = lambda record: (record.step, record.evaluations, record.fun, record.sigma)
     assert list(map(pick, resumed.history)) == list(map(pick, whole.history))
     assert (resumed.fun, resumed.smoothed) == (whole.fun, whole.smoothed)
 
@@ -430,13 +415,14 @@ def test_a_sample_that_is_nan_ends_the_run_with_what_was_found():
     assert len(found.history) > 0
     assert np.all(np.isfinite([*found.y, found.fun]))
     assert found.y[0] <= 0.7
-    assert found.evaluations == (len(found.history) + 1) * 6
+    assert found.evaluations == len(found.history) + 1
 
 
-@pytest.mark.parametrize("name", ["num_samples", "history"])
-def test_too_few_samples_are_refused(name):
-    with pytest.raises(ValueError, match=f"{name} must be at least 2"):
-        sd.NewtonCG(**{"sigma": 0.1, name: 1})
+def test_too_few_samples_are_refused():
+    with pytest.raises(ValueError, match="at least one evaluation"):
+        sd.NewtonCG(0.1, num_samples=0)
+    with pytest.raises(ValueError, match="history must be at least 2"):
+        sd.NewtonCG(0.1, history=1)
 
 
 def test_negative_restarts_are_refused():

@@ -7,7 +7,8 @@ import pytest
 import scipy.optimize
 
 from smoothdiff._solvers._bounded_step import bounded_step
-from smoothdiff._solvers._residual_history import History
+from smoothdiff._solvers._evaluator import half_squares
+from smoothdiff._solvers._history import History
 from smoothdiff._solvers._residual_trust import Proposal, TrustRegion
 
 STEP = jax.jit(bounded_step)
@@ -82,11 +83,12 @@ def known(points):
     points = jnp.asarray(points)
     rows = 1 + points @ jnp.asarray(JACOBIAN)
     empty = History.empty(12, 3, 7, points.dtype)
-    return empty.after(points, rows, jnp.ones(len(points), bool), jnp.asarray(len(points)))
+    funs, good = half_squares(rows), jnp.ones(len(points), bool)
+    return empty.after(points, rows, funs, good, jnp.asarray(len(points)))
 
 
 def propose(trust, history):
-    center, row = history.best(jnp.zeros(3))
+    center, row, _ = history.best(jnp.zeros(3))
     proposal = trust.propose(history, center, row, jnp.ones(3), NONE, 1)
     return proposal, center, row
 
@@ -148,13 +150,15 @@ def test_steps_that_change_nothing_or_are_predicted_no_better_are_rough():
 def test_the_best_point_stays_in_the_history(x64):
     history = known([[0.0, 0, 0]])
     best = jnp.asarray([[0.5, 0.5, 0.5]])
-    history = history.after(best, jnp.zeros((1, 7)), jnp.ones(1, bool), jnp.asarray(1))
+    history = history.after(
+        best, jnp.zeros((1, 7)), jnp.zeros(1), jnp.ones(1, bool), jnp.asarray(1)
+    )
     for i in range(40):
         point = jnp.full((1, 3), float(i))
         rows = jnp.full((1, 7), 1.0 + i)
         room = history.keeping_best(1)
-        history = room.after(point, rows, jnp.ones(1, bool), jnp.asarray(1))
-    point, row = history.best(jnp.zeros(3))
+        history = room.after(point, rows, half_squares(rows), jnp.ones(1, bool), jnp.asarray(1))
+    point, row, _ = history.best(jnp.zeros(3))
     np.testing.assert_array_equal(point, best[0])
     np.testing.assert_array_equal(row, np.zeros(7))
     assert history.points[-1, 0] == 39

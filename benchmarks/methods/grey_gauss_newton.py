@@ -132,7 +132,7 @@ class Solvers:
         at, state, _ = _batch_by_batch.step(self._solver, self._function, start, *rest)
         history = state.search.history
         last = slice(-self._samples, None)
-        seen: jax.Array = history.residuals[last].reshape(-1, *picture.shape) + picture[None]
+        seen: jax.Array = history.rows[last].reshape(-1, *picture.shape) + picture[None]
         seen = jnp.where(history.valid[last, None, None, None], seen, jnp.nan)
         points = jnp.append(tried, history.points[last], 0)
         return at, state, Rendered(points, jnp.append(shown, seen, 0))

@@ -20,17 +20,16 @@ from smoothdiff._solvers._base import (
     unless_failed,
 )
 from smoothdiff._solvers._batch_search import BatchSearch
+from smoothdiff._solvers._evaluator import Evaluator, half_squares
+from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import judged, judging
 from smoothdiff._solvers._local_steps import TRIED, steps_to_try
 from smoothdiff._solvers._parameter_regression import gauss_newton_step
 from smoothdiff._solvers._residual_batch import (
     ResidualBatch,
-    Residuals,
     around,
     fresh_loss,
-    loss_at,
 )
-from smoothdiff._solvers._residual_history import History
 from smoothdiff._solvers._restarts import Restarts
 from smoothdiff._solvers._wide_rounds import LONGEST, further, next_scale, sides_of
 
@@ -78,7 +77,7 @@ def _points(solver: Any, params: Params, key: Array, sigma: Array, count: int) -
 
 
 def _batch(
-    solver: Any, residuals: Residuals, key: Array, sigma: Array, y: PyTree, search: BatchSearch
+    solver: Any, residuals: Evaluator, key: Array, sigma: Array, y: PyTree, search: BatchSearch
 ) -> tuple[ResidualBatch, PyTree]:
     """The iterate and samples around it, fewer of them once they differ; and aux.
 
@@ -126,12 +125,14 @@ def step(
     """One batch, one regression, one step."""
     progress, search = state.progress, state.search
     params = smoothed_params(solver, y, progress.step, options)
-    residuals = Residuals(fn, args, params, solver.batch_size)
+    residuals = Evaluator(fn, args, params, True, solver.batch_size)
     key = jax.random.fold_in(read_options(options)[0], progress.step)
     count, _, tried = sizes_of(solver, y)
     sigma = params.sigma * search.scale
     batch, aux = _batch(solver, residuals, key, sigma, y, search)
-    history = search.history.after(batch.points, batch.rows, batch.good, batch.count)
+    history = search.history.after(
+        batch.points, batch.rows, half_squares(batch.rows), batch.good, batch.count
+    )
 
     center, here = params.theta, batch.rows[0]
     if not tried:
@@ -140,12 +141,12 @@ def step(
     sides = sides_of(params, center, sigma)
     # steps that are evaluated are so within the bounds
     known = (None, None) if tried else sides
-    move, error = gauss_newton_step(u, history.residuals, history.valid, *known)
+    move, error = gauss_newton_step(u, history.rows, history.valid, *known)
     longest = jnp.max(jnp.abs(move))
     move = move / jnp.maximum(1, longest / LONGEST)
     point, there = batch.lowest()
     if tried:
-        steps = steps_to_try(move, u, history.residuals, history.valid, here, count, *sides)
+        steps = steps_to_try(move, u, history.rows, history.valid, here, count, *sides)
         move, longest, end, at_end = _best(residuals, sigma, steps, here)
         point, there = jnp.where(at_end < there, end, point), jnp.minimum(there, at_end)
     theta = params.clip(center + sigma * move)
@@ -190,18 +191,18 @@ def judge(
     def estimate(y):
         params = smoothed_params(solver, y, progress.step, options)
         points = _points(solver, params, key, params.sigma * scale, count)
-        residuals = Residuals(fn, args, params, solver.batch_size)
+        residuals = Evaluator(fn, args, params, True, solver.batch_size)
         return fresh_loss(residuals, points, solver.nonfinite)
 
     params = smoothed_params(solver, y, progress.step, options)
-    values = loss_at(Residuals(fn, args, params, solver.batch_size))
+    values = Evaluator(fn, args, params, True, solver.batch_size).values
     # every iterate but the last was evaluated
     old = progress.start_y, progress.best_y
     return judged(progress, values, estimate, count, [y], old)
 
 
 def _best(
-    residuals: Residuals, sigma: Array, steps: Float[Array, "k n"], here: Float[Array, " P"]
+    residuals: Evaluator, sigma: Array, steps: Float[Array, "k n"], here: Float[Array, " P"]
 ) -> tuple[Array, Array, Array, Array]:
     """The step that leads to the smallest sum of squares, if that is a smaller one, and its length.
 

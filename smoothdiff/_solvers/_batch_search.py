@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from smoothdiff._solvers._residual_history import History
+from smoothdiff._solvers._history import History
 
 # so many small steps in a row count as convergence
 _SMALL = 3

@@ -18,8 +18,11 @@ def bounded_step(
     radius: Float[Array, ""],
     low: Float[Array, " n"] | None,
     high: Float[Array, " n"] | None,
+    shape: Float[Array, "n n"] | None = None,
 ) -> Float[Array, " n"]:
     r"""Minimises $g \cdot p + \tfrac12 p \cdot H p$ over $|p| \le r$ and $l \le p \le h$.
+
+    With a `shape` B, the radius is one of $\sqrt{p \cdot B p}$.
 
     Exactly, where no bound is met. Where one is, by steps from zero, each of them the minimiser
     over the parameters that may still move, up to the first bound or clipped, whichever is lower.
@@ -30,8 +33,9 @@ def bounded_step(
     """
     everything = jnp.ones(grad.shape, bool)
     if low is None or high is None:
-        return _within(hessian, grad, radius, everything)
-    near, far = jnp.maximum(low, -radius), jnp.minimum(high, radius)
+        return _within(hessian, grad, radius, everything, shape)
+    reach = radius if shape is None else radius * _extent(shape)
+    near, far = jnp.maximum(low, -reach), jnp.minimum(high, reach)
     shares = jnp.asarray(_SHARES, grad.dtype)
 
     def again(carry: tuple) -> tuple:
@@ -39,7 +43,7 @@ def bounded_step(
         p, value, _, times = carry
         slope = grad + dot(hessian, p)
         free = ~(((p <= near) & (slope > 0)) | ((p >= far) & (slope < 0)))
-        step = _within(hessian, slope, radius, free)
+        step = _within(hessian, slope, radius, free, shape)
         crossed = jnp.any((p + step < low) | (p + step > high))
         room = jnp.where(step > 0, far - p, near - p)
         moves = step != 0
@@ -58,14 +62,38 @@ def bounded_step(
     return jax.lax.while_loop(going, again, start)[0]
 
 
-def _within(hessian: Array, grad: Array, radius: Array, free: Bool[Array, " n"]) -> Array:
+def _extent(shape: Array) -> Array:
+    """How far the unit ball of a shape reaches along each parameter."""
+    return jnp.linalg.norm(_inverse_root(shape), axis=0)
+
+
+def _inverse_root(shape: Array) -> Array:
+    """L^-1 of the Cholesky factor L."""
+    identity = jnp.eye(len(shape), dtype=shape.dtype)
+    return jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(shape), identity, lower=True)
+
+
+def _within(
+    hessian: Array, grad: Array, radius: Array, free: Bool[Array, " n"], shape: Array | None
+) -> Array:
     """The minimiser over the ball, of the free parameters alone."""
-    tiny, eps = jnp.finfo(grad.dtype).tiny, jnp.finfo(grad.dtype).eps
     size = jnp.arange(len(grad))
-    hessian = jnp.where(free[:, None] & free[None], hessian, 0)
-    hessian = hessian.at[size, size].add(jnp.where(free, 0, 1))
+    both, held = free[:, None] & free[None], jnp.where(free, 0, 1)
+    hessian = jnp.where(both, hessian, 0).at[size, size].add(held)
+    grad = jnp.where(free, grad, 0)
+    if shape is None:
+        return jnp.where(free, _within_ball(hessian, grad, radius), 0)
+    # in coordinates in which the shape is a ball
+    root = _inverse_root(jnp.where(both, shape, 0).at[size, size].add(held))
+    step = _within_ball(dot(dot(root, hessian), root.T), dot(root, grad), radius)
+    return jnp.where(free, dot(root.T, step), 0)
+
+
+def _within_ball(hessian: Array, grad: Array, radius: Array) -> Array:
+    """The minimiser over the ball."""
+    tiny, eps = jnp.finfo(grad.dtype).tiny, jnp.finfo(grad.dtype).eps
     values, vectors = jnp.linalg.eigh(hessian)
-    along = dot(vectors.T, jnp.where(free, grad, 0))
+    along = dot(vectors.T, grad)
     least = jnp.maximum(-values[0], 0) + eps * jnp.max(jnp.abs(values)) + tiny
 
     def length(shift: Array) -> tuple[Array, Array]:
@@ -85,4 +113,4 @@ def _within(hessian: Array, grad: Array, radius: Array, free: Bool[Array, " n"])
     side = jnp.where(along[0] > 0, -1, 1).astype(p.dtype)
     p = p.at[0].add(jnp.where(values[0] < 0, side * rest, 0))
     p = dot(vectors, p)
-    return jnp.where(free, p * jnp.minimum(1, radius / jnp.maximum(jnp.linalg.norm(p), tiny)), 0)
+    return p * jnp.minimum(1, radius / jnp.maximum(jnp.linalg.norm(p), tiny))

@@ -1,6 +1,6 @@
-"""Gauss-Newton with few parameters, on a function that is evaluated point by point."""
+"""The loop around searches that evaluate a function point by point: bounds, noise, restarts."""
 
-import math
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -20,14 +20,13 @@ from smoothdiff._solvers._base import (
     smoothed_params,
     unless_failed,
 )
+from smoothdiff._solvers._evaluator import Evaluator
 from smoothdiff._solvers._judgement import judged, judging
-from smoothdiff._solvers._residual_batch import Residuals, half_squares, loss_at
-from smoothdiff._solvers._residual_history import History
-from smoothdiff._solvers._residual_search import ResidualSearch, Sizes
+from smoothdiff._solvers._point_search import AbstractPointSearch, Sizes
 
 # by default a search ends after so many evaluations for each parameter, and one, without a lower
 # point
-_PATIENCE = 20
+PATIENCE = 20
 # the widths of later searches without bounds, relative to sigma, as powers of two at random
 _WIDTHS = 2.0
 
@@ -36,63 +35,49 @@ class PointState(eqx.Module):
     """The state of a run: `restarts` counts the searches that may still follow."""
 
     progress: Progress
-    search: ResidualSearch
+    search: AbstractPointSearch
     restarts: Array
 
 
-def sizes_of(solver: Any, y: PyTree[Array]) -> Sizes:
-    """One evaluation a step, or as many as the user says can run at once."""
-    n = sum(leaf.size for leaf in jax.tree.leaves(y))
-    first = solver.num_samples or 4 + int(3 * math.log(n))
-    # what the history has need not be seen again
-    later = first if solver.num_samples else min(first, max(2, n))
-    return Sizes(solver.num_samples or 1, first, later)
+def final_evaluations(candidates: int) -> int:
+    """The best point again, and so many candidates of the search; with noise the start as well."""
+    return judging(0, new=candidates, old=1)
 
 
-def evaluations_per_step(solver: Any, y: PyTree[Array]) -> int:
-    """One, unless more can run at once."""
-    return sizes_of(solver, y).step
-
-
-def final_evaluations(solver: Any, y: PyTree[Array]) -> int:
-    """The best point again; with noise the start as well."""
-    return judging(0, new=0, old=1)
-
-
-def init(solver: Any, y: PyTree[Array], options: dict[str, Any], size: int) -> PointState:
-    """Nothing is known of so many residuals."""
-    params = smoothed_params(solver, y, jnp.asarray(0, jnp.int32), options)
-    n, dtype = params.theta.size, params.theta.dtype
-    sizes = sizes_of(solver, y)
-    usual = max(min(max(12 * n, 32), 256), 3 * sizes.first, 2 * n)
-    length = max(solver.history or usual, sizes.first, n + 2)
-    search = ResidualSearch.of(params.theta, History.empty(length, n, size, dtype))
+def init(solver: Any, y: PyTree[Array], search: AbstractPointSearch) -> PointState:
+    """The state before a search that has evaluated nothing."""
     restarts = jnp.asarray(solver.restarts, jnp.int32)
-    return PointState(Progress.start(y, dtype), search, restarts)
+    return PointState(Progress.start(y, search.start.dtype), search, restarts)
 
 
 def step(
-    solver: Any, fn: Any, y: PyTree[Array], args: PyTree, options: dict, state: PointState
+    solver: Any,
+    sizes: Sizes,
+    evaluator: Callable[[Params], Evaluator],
+    y: PyTree[Array],
+    options: dict,
+    state: PointState,
 ) -> tuple[PyTree[Array], PointState, PyTree]:
     """The next evaluation, or as many as run at once."""
     progress, search = state.progress, state.search
     params = smoothed_params(solver, y, progress.step, options)
-    sizes = sizes_of(solver, y)
+    evaluate = evaluator(params)
     key = read_options(options)[0]
-    draw = partial(_samples, solver, key, search, params, sizes)
+    draw = partial(_samples, solver, key, search, params)
     points, proposal = search.propose(params, draw, sizes)
     points = kept(jax.vmap(params.clip)(points))
-    rows, aux = Residuals(fn, args, params, solver.batch_size)(points)
-    good = jnp.isfinite(jnp.sum(rows**2, axis=1))
-    rows = jnp.where(good[:, None], rows, 0)
-    after = search.after(params, points, rows, good, proposal, sizes)
+    rows, aux = evaluate(points)
+    funs = evaluate.funs(rows)
+    good = jnp.isfinite(funs)
+    rows, known = jnp.where(good[:, None], rows, 0), jnp.where(good, funs, 0)
+    after = search.after(params, points, rows, known, good, proposal, sizes)
 
     theta, width = after.iterate(), after.width()
     new_y = params.layout.tree(theta)
     with promotion():
         moved = jnp.abs(theta - params.theta) + params.sigma * width
         small = solver.norm(params.layout.tree(moved)) < solver.atol + solver.rtol * solver.norm(y)
-    point, fun = lowest(points, jnp.where(good, half_squares(rows), jnp.inf))
+    point, fun = lowest(points, jnp.where(good, funs, jnp.inf))
     after = after.counted(small, fun < progress.lowest_fun, sizes.step)
     # the end of a step that is tried may be anything, and so may a place that nobody asked for
     later = state.restarts < solver.restarts
@@ -102,21 +87,19 @@ def step(
         finite = after.enough(sizes.first)
     finite &= jnp.all(jnp.isfinite(theta))
     new_y, after = unless_failed(finite, (new_y, after), (y, search))
-    _, best = after.history.best(theta)
+    best = after.history.best(theta)[2]
     unknown = jnp.asarray(jnp.nan, theta.dtype)
     seen = Seen(params.layout.tree(point), fun)
-    progress = progress.after(
-        y, jnp.sum(best**2) / 2, unknown, params.sigma * width, sizes.step, finite, seen
-    )
+    progress = progress.after(y, best, unknown, params.sigma * width, sizes.step, finite, seen)
     restarts = state.restarts
     if solver.restarts:
-        patience = solver.patience or _PATIENCE * (params.theta.size + 1)
         lost = later & ~jnp.any(after.history.valid)
-        ended = (restarts > 0) & after.over(patience)
+        ended = (restarts > 0) & after.over(sizes)
         again = finite & (ended | lost)
         lowest_theta = params.layout.vector(jax.tree.leaves(progress.lowest_y))
-        theta = _anywhere(params, jax.random.fold_in(key, progress.evaluations), lowest_theta)
-        anew = after.again(theta)
+        place, other = jax.random.split(jax.random.fold_in(key, progress.evaluations))
+        theta = _anywhere(params, place, lowest_theta)
+        anew = after.again(params, theta, other)
         new_y, after = jax.tree.map(
             lambda a, b: jnp.where(again, a, b), (params.layout.tree(theta), anew), (new_y, after)
         )
@@ -124,31 +107,34 @@ def step(
     return new_y, PointState(progress, after, restarts), aux
 
 
-def judge(
-    solver: Any, fn: Any, y: PyTree[Array], args: PyTree, options: dict, state: PointState
-) -> tuple[PyTree[Array], dict[str, Array]]:
-    """The best point. The smoothed loss is that of the model, at no further evaluation."""
-    progress, search = state.progress, state.search
-    params = smoothed_params(solver, y, progress.step, options)
-    values = loss_at(Residuals(fn, args, params, solver.batch_size))
+def judge(evaluate: Evaluator, state: PointState) -> tuple[PyTree[Array], dict[str, Array]]:
+    """The best point of those seen and of what the models say.
+
+    The smoothed function is that of the model, at no further evaluation.
+    """
+    progress = state.progress
     unknown = jnp.asarray(jnp.nan, progress.fun.dtype)
 
     def estimate(y: PyTree) -> tuple[Array, Array, Seen]:
-        jacobian = search.trust.jacobian * search.width()
-        smoothed = progress.lowest_fun + jnp.sum(jacobian**2) / 2
+        smoothed = progress.lowest_fun + state.search.smoothing()
         return smoothed, unknown, Seen(y, jnp.full_like(unknown, jnp.inf))
 
-    return judged(progress, values, estimate, 0, [], [progress.start_y])
+    params = evaluate.params
+    new = [params.layout.tree(params.clip(theta)) for theta in state.search.candidates()]
+    return judged(progress, evaluate.values, estimate, 0, new, [progress.start_y])
 
 
 def _samples(
-    solver: Any, key: Array, search: ResidualSearch, params: Params, sizes: Sizes
+    solver: Any, key: Array, search: AbstractPointSearch, params: Params, count: int
 ) -> Array:
     """Standard normal points for a round."""
-    key = jax.random.fold_in(key, search.wide.rounds)
-    sampler, count = solver.sampler or Sobol(), max(sizes.first - 1, 1)
+    key = jax.random.fold_in(key, search.round())
+    sampler = solver.sampler or Sobol()
     draws = Draws(sampler, key, count, params.theta.size, params.theta.dtype, None)
-    return draws.map(lambda z, _: z)
+    z, log_ratio = draws.map(lambda z, log_ratio: (z, log_ratio))
+    if log_ratio is not None or not sampler.gaussian:
+        raise ValueError(f"{sampler} has weights: {type(solver).__name__} needs normal points")
+    return z
 
 
 def _anywhere(params: Params, key: Array, lowest: Array) -> Array:

@@ -1,8 +1,5 @@
 """Residuals at points around an iterate: where they are taken, what came, what counts."""
 
-from collections.abc import Callable
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,26 +9,7 @@ from smoothdiff._draws import Draws
 from smoothdiff._params import Params
 from smoothdiff._samplers import AbstractSampler
 from smoothdiff._seen import Seen, kept, lowest
-
-
-class Residuals(eqx.Module):
-    """The function with its arguments, as rows of residuals at rows of parameters."""
-
-    fn: Callable[[PyTree, Any], tuple[PyTree, PyTree]]
-    args: PyTree
-    params: Params
-    batch_size: int | None = eqx.field(static=True)
-
-    def __call__(self, points: Float[Array, "m n"]) -> tuple[Float[Array, "m P"], PyTree]:
-        """Also the aux of the first."""
-
-        def row(x: Array) -> tuple[Array, PyTree]:
-            out, aux = self.fn(self.params.layout.tree(x), self.args)
-            leaves = [jnp.ravel(leaf).astype(x.dtype) for leaf in jax.tree.leaves(out)]
-            return jnp.concatenate(leaves), aux
-
-        rows, aux = jax.lax.map(row, points, batch_size=self.batch_size or len(points))
-        return rows, jax.tree.map(lambda a: a[0], aux)
+from smoothdiff._solvers._evaluator import Evaluator, half_squares
 
 
 class ResidualBatch(eqx.Module):
@@ -117,24 +95,8 @@ def check_residuals(f_struct: PyTree) -> None:
             )
 
 
-def half_squares(rows: Float[Array, "m P"]) -> Float[Array, " m"]:
-    """What least squares minimises, of each row."""
-    return jnp.sum(rows**2, axis=1) / 2
-
-
-def loss_at(residuals: Residuals) -> Callable[[PyTree[Array]], Float[Array, " m"]]:
-    """Half the sum of squares as a function of stacked points."""
-
-    def values(points: PyTree[Array]) -> Array:
-        vector = residuals.params.layout.vector
-        rows, _ = residuals(jax.vmap(lambda y: vector(jax.tree.leaves(y)))(points))
-        return half_squares(rows)
-
-    return values
-
-
 def fresh_loss(
-    residuals: Residuals, points: Float[Array, "m n"], nonfinite: str
+    residuals: Evaluator, points: Float[Array, "m n"], nonfinite: str
 ) -> tuple[Float[Array, ""], Float[Array, ""], Seen]:
     """The smoothed loss by these points, its standard error, and the lowest of the points.
 

@@ -7,7 +7,6 @@ samples around a center, which may go uphill, until its steps come true.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,49 +14,28 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
-from smoothdiff._solvers._residual_history import History
+from smoothdiff._solvers._history import History
+from smoothdiff._solvers._point_search import FIRST, TRUST, WIDE, AbstractPointSearch, Sizes
 from smoothdiff._solvers._residual_trust import Proposal, TrustRegion
 from smoothdiff._solvers._wide_rounds import Wide, further, sides_of
 
-# what is evaluated next
-FIRST, TRUST, WIDE = 0, 1, 2
 # evaluations of wide rounds since the last lower point, for each parameter, until the local model
 # is tried there, and its radius then, in widths
 _IDLE, _NARROWER = 6, 0.1
 # so many steps in a row that halve the loss, within the width, are trusted again
 _TRUE = 2
-# so many small steps in a row count as convergence
-_SMALL = 3
 
 
-class Sizes(NamedTuple):
-    """Evaluations a step, and samples of a first wide round and of a later one."""
+class ResidualSearch(AbstractPointSearch):
+    """Where a search stands, with the local model and the wide one."""
 
-    step: int
-    first: int
-    later: int
-
-
-class ResidualSearch(eqx.Module):
-    """Where a search stands: all that was evaluated, and what comes next.
-
-    `evaluated` counts the evaluations, `small` the small steps in a row, `stale` the evaluations
-    since the last lower point.
-    """
-
-    stage: Int[Array, ""]
-    history: History
-    start: Float[Array, " n"]
-    evaluated: Int[Array, ""]
     trust: TrustRegion
     wide: Wide
-    small: Int[Array, ""]
-    stale: Int[Array, ""]
 
     @staticmethod
     def of(theta: Float[Array, " n"], history: History) -> "ResidualSearch":
         """Nothing is known but what is in the history."""
-        n, size = len(theta), history.residuals.shape[1]
+        n, size = len(theta), history.rows.shape[1]
         one, none = jnp.ones((), theta.dtype), jnp.zeros((), jnp.int32)
         return ResidualSearch(
             stage=jnp.asarray(FIRST, jnp.int32),
@@ -70,52 +48,34 @@ class ResidualSearch(eqx.Module):
             stale=none,
         )
 
-    def again(self, theta: Float[Array, " n"]) -> "ResidualSearch":
+    def again(self, params: Params, theta: Float[Array, " n"], key: Array) -> "ResidualSearch":
         """Another search, from elsewhere, with other random numbers."""
         empty = jax.tree.map(jnp.zeros_like, self.history)
         anew = ResidualSearch.of(theta, empty)
         return eqx.tree_at(lambda s: s.wide.rounds, anew, self.wide.rounds + 1)
 
-    def counted(self, small: Array, lower: Array, count: int) -> "ResidualSearch":
-        """With a small step more or less, and so many evaluations."""
-        small = jnp.where(small, self.small + 1, 0)
-        stale = jnp.where(lower, 0, self.stale + count)
-        counts = self.evaluated + count, small, stale
-        return eqx.tree_at(lambda s: (s.evaluated, s.small, s.stale), self, counts)
-
-    def enough(self, count: int) -> Bool[Array, ""]:
-        """Whether half of the last so many evaluations gave numbers, once there are so many."""
-        return (self.evaluated < count) | self.history.mostly_valid(count)
-
-    def converged(self) -> Bool[Array, ""]:
-        """Whether the last steps were small."""
-        return self.small >= _SMALL
-
-    def over(self, patience: int) -> Bool[Array, ""]:
+    def over(self, sizes: Sizes) -> Bool[Array, ""]:
         """Whether it converged, or so many evaluations in a row were no lower."""
-        return self.converged() | (self.stale >= patience)
+        return self.converged() | (self.stale >= sizes.patience)
 
-    def is_local(self) -> Bool[Array, ""]:
-        """Whether a step within the trust region comes next."""
-        return self.stage == TRUST
+    def round(self) -> Int[Array, ""]:
+        """So many wide rounds."""
+        return self.wide.rounds
+
+    def smoothing(self) -> Float[Array, ""]:
+        """Half the squares of what the linear model adds."""
+        return jnp.sum((self.trust.jacobian * self.width()) ** 2) / 2
 
     def width(self) -> Float[Array, ""]:
         """How far from the iterate the function is looked at, relative to sigma."""
         return jnp.where(self.stage == WIDE, self.wide.scale, self.trust.radius)
 
-    def iterate(self) -> Float[Array, " n"]:
-        """The best point."""
-        return self.history.best(self.start)[0]
-
     def propose(
-        self, params: Params, draw: Callable[[], Float[Array, "first n"]], sizes: Sizes
+        self, params: Params, draw: Callable[[int], Float[Array, "k n"]], sizes: Sizes
     ) -> tuple[Float[Array, "K n"], Proposal]:
-        """The next points to evaluate, not yet within the bounds, and what the model says of them.
-
-        `draw` makes the samples of the round, which are standard normal.
-        """
+        """The first points, the end of a step, or the next samples of a round."""
         sigma = params.sigma
-        count, size = sizes.step, self.history.residuals.shape[1]
+        count, size = sizes.step, self.history.rows.shape[1]
         n, dtype = len(sigma), sigma.dtype
         slot = jnp.arange(count, dtype=jnp.int32)
         nothing = Proposal(
@@ -134,18 +94,18 @@ class ResidualSearch(eqx.Module):
                 units = jnp.where(((high >= 1) | (high >= -low))[:, None], units, -units)
             table = jnp.concatenate([jnp.zeros((1, n), dtype), units])
             if count > 1:
-                table = jnp.concatenate([table, draw()])
+                table = jnp.concatenate([table, draw(max(sizes.first - 1, 1))])
             at = jnp.minimum(self.evaluated + slot, len(table) - 1)
             return self.start[None] + sigma[None] * table[at], nothing
 
         def local() -> tuple[Array, Proposal]:
-            center, row = self.history.best(self.start)
+            center, row, _ = self.history.best(self.start)
             sides = sides_of(params, center)
             proposal = self.trust.propose(self.history, center, row, sigma, sides, count)
             return center[None] + sigma[None] * proposal.steps, proposal
 
         def wide() -> tuple[Array, Proposal]:
-            wide, samples = self.wide, draw()
+            wide, samples = self.wide, draw(max(sizes.first - 1, 1))
             at = wide.taken + slot
             width = sigma * wide.scale
             points = (
@@ -162,15 +122,14 @@ class ResidualSearch(eqx.Module):
         params: Params,
         points: Float[Array, "K n"],
         rows: Float[Array, "K P"],
+        funs: Float[Array, " K"],
         good: Bool[Array, " K"],
         proposal: Proposal,
         sizes: Sizes,
     ) -> "ResidualSearch":
         """The search with these residuals at these points."""
-        room = self.history.keeping_best(sizes.step)
-        kept = room.after(points, rows, good, jnp.asarray(sizes.step))
         here = self.history.best(self.start)
-        with_rows = eqx.tree_at(lambda s: s.history, self, kept)
+        with_rows = self.kept(points, rows, funs, good, sizes.step)
         by_stage = [
             lambda: with_rows._after_first(sizes),
             lambda: with_rows._after_local(here[1], rows, good, proposal),
@@ -179,7 +138,7 @@ class ResidualSearch(eqx.Module):
         return jax.lax.switch(self.stage, by_stage)
 
     def _to_wide(self, scale: Array) -> "ResidualSearch":
-        center, row = self.history.best(self.start)
+        center, row, _ = self.history.best(self.start)
         wide = Wide.start(center, row, scale)
         # the center is known: the samples begin at once
         wide = eqx.tree_at(
@@ -192,8 +151,8 @@ class ResidualSearch(eqx.Module):
         enough = self.evaluated + sizes.step > len(self.start)
         stage = jnp.where(enough, TRUST, FIRST).astype(self.stage.dtype)
         known = eqx.tree_at(lambda s: s.stage, self, stage)
-        _, row = self.history.best(self.start)
-        moved = jnp.any(self.history.residuals != row[None], axis=1) & self.history.valid
+        _, row, _ = self.history.best(self.start)
+        moved = jnp.any(self.history.rows != row[None], axis=1) & self.history.valid
         few = 2 * (1 + jnp.sum(moved)) <= jnp.sum(self.history.valid)
         return _where(enough & few, known._to_wide(jnp.ones_like(self.wide.scale)), known)
 
@@ -211,14 +170,14 @@ class ResidualSearch(eqx.Module):
         wide, first = self.wide, self.wide.taken == 0
         wanted = jnp.where(wide.seen, sizes.later, sizes.first)
         fun = jnp.where(good[0], jnp.sum(rows[0] ** 2) / 2, jnp.inf)
-        _, lowest = self.history.best(self.start)
+        _, lowest, _ = self.history.best(self.start)
         near = jnp.max(jnp.abs(wide.move / (params.sigma * wide.scale))) < 1
         held = (fun < wide.before / 2) & (fun <= jnp.sum(lowest**2) / 2) & near
         true = jnp.where(first, jnp.where(held, wide.true + 1, 0), wide.true)
         before = jnp.where(first, fun, wide.before)
         row = jnp.where(first, jnp.where(good[0], rows[0], jnp.inf), wide.row)
         taken = wide.taken + sizes.step
-        newest = self.history.residuals[-sizes.step :]
+        newest = self.history.rows[-sizes.step :]
         lower = jnp.any(jnp.all(newest == lowest[None], axis=1) & good)
         idle = jnp.where(lower, 0, wide.idle + sizes.step)
         found = wide.found | lower
@@ -238,9 +197,7 @@ class ResidualSearch(eqx.Module):
             _NARROWER * jnp.minimum(wide.scale, 1),
         )
         radius = jnp.maximum(jnp.asarray(radius), jnp.finfo(fun.dtype).eps)
-        trust = TrustRegion.start(
-            jnp.asarray(radius), len(self.start), self.history.residuals.shape[1]
-        )
+        trust = TrustRegion.start(jnp.asarray(radius), len(self.start), self.history.rows.shape[1])
         back = eqx.tree_at(
             lambda s: (s.stage, s.trust), self, (jnp.full_like(self.stage, TRUST), trust)
         )

@@ -17,7 +17,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._solvers._base import dot
 from smoothdiff._solvers._bounded_step import bounded_step
-from smoothdiff._solvers._residual_history import History
+from smoothdiff._solvers._history import History
+from smoothdiff._solvers._point_search import powers_of_two
 
 # evaluations that a fit may use for each parameter, and how far they count, in radii
 _USED, _REACH, _FARTHEST = 3, 1.5, 2.0
@@ -102,8 +103,7 @@ class TrustRegion(eqx.Module):
         """Minimisers of the model within this radius and others, or a point for the geometry."""
         jacobian, lacking, poor = self._fit(history, center, row, sigma)
         hessian, grad = dot(jacobian, jacobian.T), dot(jacobian, row)
-        power = jnp.asarray([(j + 1) // 2 * (-1) ** j for j in range(count)], row.dtype)
-        radii = self.radius * 2.0**-power
+        radii = self.radius * powers_of_two(count, row.dtype)
         steps = jax.vmap(lambda radius: bounded_step(hessian, grad, radius, *sides))(radii)
         change, slope = dot(steps, jacobian), -dot(steps, grad)
         promised = slope - jnp.sum(change**2, axis=1) / 2
@@ -134,7 +134,7 @@ class TrustRegion(eqx.Module):
         far = jnp.asarray(jnp.where(used, distance, 0)) / width
         weight = jnp.where(used, 1 / (1 + (far / _REACH) ** 4), 0)
         a = jnp.where(used[:, None], away[near], 0) / width
-        change = jnp.where(used[:, None], history.residuals[near] - row[None], 0)
+        change = jnp.where(used[:, None], history.rows[near] - row[None], 0)
         # by singular values, since squares of them would take half of the digits
         root = jnp.sqrt(weight)
         left, values, right = jnp.linalg.svd(a * root[:, None], full_matrices=False)

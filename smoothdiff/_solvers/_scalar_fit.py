@@ -26,6 +26,9 @@ _SHARES = ((0.1, 1.0), (1.0, 0.1), (1.0, 0.0))
 _RIDGES = {"float32": (1.0, 1e-1, 1e-3, 1e-4), "float64": (1.0, 1e-1, 1e-3, 1e-6, 1e-8)}
 # points farther away than this, in widths, count less and less: the fit is a local one
 _REACH = 2.0
+# values count less where they are so many times the median above the lowest, but never less than
+# the second share
+_HIGH, _FAINT = 3.0, 1e-3
 
 
 class ScalarFit(eqx.Module):
@@ -169,9 +172,18 @@ def fit(
     closeness = jnp.where(valid, closeness, 0)
     count = jnp.sum(valid).astype(dtype)
     known = jnp.where(valid, values, jnp.nan)
-    middle, scale = jnp.nanmedian(known), jnp.nanstd(known)
+    middle, least = jnp.nanmedian(known), jnp.nanmin(known)
+    # what is far above the others says little of where the function is low
+    above, high = jnp.where(valid, values - least, 0), _HIGH * (middle - least)
+    tall = (above > high) & (high > 0)
+    height = jnp.where(tall, high / jnp.where(tall, above, 1), 1)
+    closeness *= jnp.maximum(height, _FAINT)
+    above = jnp.where(tall, jnp.minimum(above, high / _FAINT), above)
+    targets = jnp.where(valid, above - (middle - least), 0)
+    mass = jnp.maximum(jnp.sum(closeness**2), jnp.finfo(dtype).tiny)
+    scale = jnp.sqrt(jnp.sum((closeness * targets) ** 2) / mass)
     scale = jnp.where(scale > 0, scale, 1)
-    targets = jnp.where(valid, (values - middle) / scale, 0)
+    targets = targets / scale
     gram = dot(points, points.T) / points.shape[1]
     apart = spread[:, None] + spread[None] - 2 * gram
     radial = jnp.exp(-jnp.maximum(apart, 0) / 2)

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
+from smoothdiff._solvers._history import History
 from smoothdiff._solvers._parameter_regression import gauss_newton_step
-from smoothdiff._solvers._residual_history import History
 
 # sigma follows twice the standard error of the step, at most so much smaller or larger at a time
 _SHRINK, _GROW = 0.25, 1.5
@@ -54,13 +54,13 @@ class Wide(eqx.Module):
         center, here = history.lowest(self.center, self.row)
         u = (history.points - center[None]) / sigma[None]
         sides = sides_of(params, center, sigma)
-        move, error = gauss_newton_step(u, history.residuals, history.valid, *sides)
+        move, error = gauss_newton_step(u, history.rows, history.valid, *sides)
         longest = jnp.max(jnp.abs(move))
         move = move / jnp.maximum(1, longest / LONGEST)
         theta = params.clip(center + sigma * move)
         fresh = history.valid & (jnp.arange(len(u)) >= len(u) - count)
-        some = history.residuals[jnp.argmax(fresh)]
-        same = jnp.all(jnp.where(fresh[:, None], history.residuals == some[None], True))
+        some = history.rows[jnp.argmax(fresh)]
+        same = jnp.all(jnp.where(fresh[:, None], history.rows == some[None], True))
         # a few that are the same call for more of them first
         flat = same & ~self.seen
         scale = next_scale(self.scale, flat, history, here, u, error, longest / LONGEST)
@@ -118,7 +118,7 @@ def next_scale(
         length: Of the step.
     """
     # a plateau of the residuals around the iterate is seen whole or not at all
-    plateau = history.valid & jnp.all(history.residuals == here[None], axis=1)
+    plateau = history.valid & jnp.all(history.rows == here[None], axis=1)
     extent = jnp.max(jnp.where(plateau, jnp.sqrt(jnp.mean(u**2, axis=1)), 0))
     wanted = jnp.maximum(2 * jnp.sqrt(jnp.mean(error**2)), length)
     wanted = jnp.clip(jnp.maximum(wanted, extent), _SHRINK, _GROW)

@@ -1,16 +1,22 @@
 """Gauss-Newton on residuals that need not be differentiable: one batch teaches all of them."""
 
+import math
 from collections.abc import Callable
 from typing import Any, Literal
 
 import jax
+import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree
 
 from smoothdiff._samplers import AbstractSampler
 from smoothdiff._solvers import _batch_by_batch, _point_by_point
-from smoothdiff._solvers._base import AbstractSmoothSolver, stopped
+from smoothdiff._solvers._base import AbstractSmoothSolver, smoothed_params, stopped
+from smoothdiff._solvers._evaluator import Evaluator
+from smoothdiff._solvers._history import History
+from smoothdiff._solvers._point_search import Sizes
 from smoothdiff._solvers._residual_batch import check_residuals
+from smoothdiff._solvers._residual_search import ResidualSearch
 from smoothdiff._solvers._restarts import check_restarts
 
 
@@ -154,28 +160,51 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         self.patience = patience
         self.restarts = restarts
 
-    def _form(self, y: PyTree[Array]) -> Any:
-        """Point by point where there are few parameters; a schedule wants samples of its width."""
+    def _point_by_point(self, y: PyTree[Array]) -> bool:
+        """Where there are few parameters, but for a schedule, which wants samples of its width."""
         many = sum(leaf.size for leaf in jax.tree.leaves(y)) >= _batch_by_batch.MANY
-        return _batch_by_batch if many or callable(self.sigma) else _point_by_point
+        return not many and not callable(self.sigma)
+
+    def _sizes(self, y: PyTree[Array]) -> Sizes:
+        """One evaluation a step, or as many as the user says can run at once."""
+        n = sum(leaf.size for leaf in jax.tree.leaves(y))
+        first = self.num_samples or 4 + int(3 * math.log(n))
+        # what the history has need not be seen again
+        later = first if self.num_samples else min(first, max(2, n))
+        patience = self.patience or _point_by_point.PATIENCE * (n + 1)
+        return Sizes(self.num_samples or 1, first, later, patience)
 
     def evaluations_per_step(self, y: PyTree[Array]) -> int:
         """One, or `num_samples`; with many parameters a batch and the steps that are tried."""
-        return self._form(y).evaluations_per_step(self, y)
+        if self._point_by_point(y):
+            return self._sizes(y).step
+        return _batch_by_batch.evaluations_per_step(self, y)
 
     def final_evaluations(self, y: PyTree[Array]) -> int:
         """Those that judge the best point."""
-        return self._form(y).final_evaluations(self, y)
+        if self._point_by_point(y):
+            return _point_by_point.final_evaluations(candidates=0)
+        return _batch_by_batch.final_evaluations(self, y)
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> Any:
         """Checks what can be looked at; evaluates nothing."""
         check_residuals(f_struct)
         size = sum(leaf.size for leaf in jax.tree.leaves(f_struct))
-        return self._form(y).init(self, y, options, size)
+        if not self._point_by_point(y):
+            return _batch_by_batch.init(self, y, options, size)
+        theta = smoothed_params(self, y, jnp.asarray(0, jnp.int32), options).theta
+        n, first = theta.size, self._sizes(y).first
+        usual = max(min(max(12 * n, 32), 256), 3 * first, 2 * n)
+        length = max(self.history or usual, first, n + 2)
+        search = ResidualSearch.of(theta, History.empty(length, n, size, theta.dtype))
+        return _point_by_point.init(self, y, search)
 
     def step(self, fn, y, args, options, state, tags):
         """The next evaluations."""
-        return self._form(y).step(self, fn, y, args, options, state)
+        if not self._point_by_point(y):
+            return _batch_by_batch.step(self, fn, y, args, options, state)
+        evaluator = lambda params: Evaluator(fn, args, params, True, self.batch_size)
+        return _point_by_point.step(self, self._sizes(y), evaluator, y, options, state)
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """After small steps in a row, or a failed one."""
@@ -183,5 +212,10 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         """Judges the best point, with noise beside others."""
-        y, stats = self._form(y).judge(self, fn, y, args, options, state)
+        if not self._point_by_point(y):
+            y, stats = _batch_by_batch.judge(self, fn, y, args, options, state)
+        else:
+            params = smoothed_params(self, y, state.progress.step, options)
+            evaluate = Evaluator(fn, args, params, True, self.batch_size)
+            y, stats = _point_by_point.judge(evaluate, state)
         return y, aux, stats

@@ -21,6 +21,7 @@ from smoothdiff._solvers._base import (
     stopped,
     unless_failed,
 )
+from smoothdiff._solvers._evaluator import Evaluator
 from smoothdiff._solvers._judgement import judged, judging
 from smoothdiff._solvers._local_ensemble import (
     DAMPINGS,
@@ -30,12 +31,10 @@ from smoothdiff._solvers._local_ensemble import (
 )
 from smoothdiff._solvers._residual_batch import (
     ResidualBatch,
-    Residuals,
     around,
     centred,
     check_residuals,
     fresh_loss,
-    loss_at,
 )
 from smoothdiff._support import AbstractSupport, as_support
 
@@ -209,7 +208,7 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         """One batch, one step in each place, the best of nine ends."""
         progress = state.progress
         params = smoothed_params(self, y, progress.step, options)
-        residuals = Residuals(fn, args, params, self.batch_size)
+        residuals = Evaluator(fn, args, params, True, self.batch_size)
         blame = Blame.of(self.support, params.layout.tree, params.theta)
         key = jax.random.fold_in(read_options(options)[0], progress.step)
         sigma = params.sigma * state.scale
@@ -253,11 +252,11 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             params = smoothed_params(self, y, progress.step, options)
             sigma = params.sigma * state.scale
             points = around(params, self.sampler, key, sigma, self._samples(y))
-            residuals = Residuals(fn, args, params, self.batch_size)
+            residuals = Evaluator(fn, args, params, True, self.batch_size)
             return fresh_loss(residuals, points, self.nonfinite)
 
         params = smoothed_params(self, y, progress.step, options)
-        values = loss_at(Residuals(fn, args, params, self.batch_size))
+        values = Evaluator(fn, args, params, True, self.batch_size).values
         # every iterate but the start is an end that was evaluated
         new, old = [progress.start_y], (y, progress.best_y)
         y, stats = judged(progress, values, estimate, self._samples(y), new, old)
@@ -265,7 +264,7 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
 
 
 def _next(
-    residuals: Residuals, blame: Blame, batch: ResidualBatch, sigma: Float[Array, " n"]
+    residuals: Evaluator, blame: Blame, batch: ResidualBatch, sigma: Float[Array, " n"]
 ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     """The best of the ends of the steps that a batch suggests, and half the sum of squares there.
 

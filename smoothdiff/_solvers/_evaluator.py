@@ -1,0 +1,50 @@
+"""The caller of the user's function: rows of what it returns at rows of parameters."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from smoothdiff._params import Params
+
+
+class Evaluator(eqx.Module):
+    """The function with its arguments.
+
+    It returns residuals, whose `squares` are minimised, or one number.
+    """
+
+    fn: Callable[[PyTree, Any], tuple[PyTree, PyTree]]
+    args: PyTree
+    params: Params
+    squares: bool = eqx.field(static=True)
+    batch_size: int | None = eqx.field(static=True)
+
+    def __call__(self, points: Float[Array, "m n"]) -> tuple[Float[Array, "m P"], PyTree]:
+        """The rows, and the aux of the first."""
+
+        def row(x: Array) -> tuple[Array, PyTree]:
+            out, aux = self.fn(self.params.layout.tree(x), self.args)
+            leaves = [jnp.ravel(leaf).astype(x.dtype) for leaf in jax.tree.leaves(out)]
+            return jnp.concatenate(leaves), aux
+
+        rows, aux = jax.lax.map(row, points, batch_size=self.batch_size or len(points))
+        return rows, jax.tree.map(lambda a: a[0], aux)
+
+    def funs(self, rows: Float[Array, "m P"]) -> Float[Array, " m"]:
+        """What is minimised, of each row."""
+        return half_squares(rows) if self.squares else rows[:, 0]
+
+    def values(self, points: PyTree[Array]) -> Float[Array, " m"]:
+        """What is minimised at stacked points."""
+        vector = self.params.layout.vector
+        rows, _ = self(jax.vmap(lambda y: vector(jax.tree.leaves(y)))(points))
+        return self.funs(rows)
+
+
+def half_squares(rows: Float[Array, "m P"]) -> Float[Array, " m"]:
+    """What least squares minimises, of each row."""
+    return jnp.sum(rows**2, axis=1) / 2

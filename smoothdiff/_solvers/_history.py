@@ -1,0 +1,81 @@
+"""The last evaluations: where they were made, what came, and which of them count."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+# a point takes the place of the iterate where that is so many times as high: of a little less the
+# noise of the function may be the reason
+_LOWER = 0.8
+
+
+class History(eqx.Module):
+    """Evaluations from the oldest to the newest; at first all of them are empty, and not `valid`.
+
+    A row holds what the function returned, residuals or one value, and `funs` what is minimised.
+    """
+
+    points: Float[Array, "M n"]
+    rows: Float[Array, "M P"]
+    funs: Float[Array, " M"]
+    valid: Bool[Array, " M"]
+
+    @staticmethod
+    def empty(length: int, n: int, size: int, dtype) -> "History":
+        """Of so many evaluations at n parameters, with so many residuals each."""
+        points, rows = jnp.zeros((length, n), dtype), jnp.zeros((length, size), dtype)
+        return History(points, rows, jnp.zeros(length, dtype), jnp.zeros(length, bool))
+
+    def after(
+        self,
+        points: Float[Array, "m n"],
+        rows: Float[Array, "m P"],
+        funs: Float[Array, " m"],
+        valid: Bool[Array, " m"],
+        count: Int[Array, ""],
+    ) -> "History":
+        """With the first `count` of these in place of as many of the oldest."""
+
+        def latest(old: Array, new: Array) -> Array:
+            return jax.lax.dynamic_slice_in_dim(jnp.concatenate([old, new]), count, len(old))
+
+        return jax.tree.map(latest, self, History(points, rows, funs, valid))
+
+    def keeping_best(self, count: int) -> "History":
+        """The best one is not among the `count` oldest, which come to make way."""
+        best = self._best()
+        place = jnp.where(best < count, count, best) % len(self.valid)
+        return jax.tree.map(lambda a: a.at[place].set(a[best]), self)
+
+    def best(self, start: Float[Array, " n"]) -> tuple[Array, Array, Array]:
+        """The lowest point, its row and its value; at first the start, and zeros.
+
+        Of equals the newest.
+        """
+        i = self._best()
+        known = jnp.any(self.valid)
+        return jnp.where(known, self.points[i], start), self.rows[i], self.funs[i]
+
+    def mostly_valid(self, count: int) -> Bool[Array, ""]:
+        """Whether at least half of the last so many are valid."""
+        return 2 * jnp.sum(self.valid[-count:]) >= count
+
+    def _known(self) -> Float[Array, " M"]:
+        return jnp.where(self.valid, self.funs, jnp.inf)
+
+    def _best(self) -> Int[Array, ""]:
+        funs = self._known()
+        return len(funs) - 1 - jnp.argmin(funs[::-1])
+
+    def lowest(
+        self, point: Float[Array, " n"], row: Float[Array, " P"]
+    ) -> tuple[Float[Array, " n"], Float[Array, " P"]]:
+        """Where the sum of squares was smallest, and the residuals there.
+
+        It is the given point, with its residuals `row`, unless those squares are clearly larger.
+        """
+        funs = self._known()
+        i = jnp.argmin(funs)
+        lower = 2 * funs[i] < _LOWER * jnp.sum(row**2)
+        return jnp.where(lower, self.points[i], point), jnp.where(lower, self.rows[i], row)

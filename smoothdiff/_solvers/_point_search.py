@@ -1,0 +1,124 @@
+"""What searches have in common that evaluate a function point by point."""
+
+import abc
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from smoothdiff._params import Params
+from smoothdiff._solvers._history import History
+
+# what is evaluated next: the first points, a step of the local model, samples around a center
+FIRST, TRUST, WIDE = 0, 1, 2
+# so many small steps in a row count as convergence
+_SMALL = 3
+
+
+class Sizes(NamedTuple):
+    """Evaluations a step, and samples of a first wide round and of a later one.
+
+    After `patience` evaluations in a row without a lower point a search ends.
+    """
+
+    step: int
+    first: int
+    later: int
+    patience: int
+
+
+class AbstractPointSearch(eqx.Module):
+    """Where a search stands: all that was evaluated, and what comes next.
+
+    `evaluated` counts the evaluations, `small` the small steps in a row, `stale` the evaluations
+    since the last lower point.
+    """
+
+    stage: Int[Array, ""]
+    history: History
+    start: Float[Array, " n"]
+    evaluated: Int[Array, ""]
+    small: Int[Array, ""]
+    stale: Int[Array, ""]
+
+    @abc.abstractmethod
+    def again(self, params: Params, theta: Float[Array, " n"], key: Array) -> "AbstractPointSearch":
+        """Another search, from elsewhere, with other random numbers."""
+
+    @abc.abstractmethod
+    def width(self) -> Float[Array, ""]:
+        """How far from the iterate the function is looked at, relative to sigma."""
+
+    @abc.abstractmethod
+    def propose(
+        self, params: Params, draw: Callable[[int], Float[Array, "k n"]], sizes: Sizes
+    ) -> tuple[Float[Array, "K n"], Any]:
+        """The next points to evaluate, not yet within the bounds, and what the model says of them.
+
+        `draw` makes so many samples of the round, which are standard normal.
+        """
+
+    @abc.abstractmethod
+    def after(
+        self,
+        params: Params,
+        points: Float[Array, "K n"],
+        rows: Float[Array, "K P"],
+        funs: Float[Array, " K"],
+        good: Bool[Array, " K"],
+        proposal: Any,
+        sizes: Sizes,
+    ) -> "AbstractPointSearch":
+        """The search with these rows and values at these points."""
+
+    @abc.abstractmethod
+    def over(self, sizes: Sizes) -> Bool[Array, ""]:
+        """Whether the search leads nowhere any more."""
+
+    @abc.abstractmethod
+    def smoothing(self) -> Float[Array, ""]:
+        """What smoothing adds to the function at the iterate, by the model."""
+
+    def candidates(self) -> list[Float[Array, " n"]]:
+        """What may be better than the lowest point, but was not evaluated."""
+        return []
+
+    def round(self) -> Int[Array, ""]:
+        """Counts the rounds of samples, so that each has random numbers of its own."""
+        return self.evaluated
+
+    def counted(self, small: Array, lower: Array, count: int) -> Any:
+        """With a small step more or less, and so many evaluations."""
+        small = jnp.where(small, self.small + 1, 0)
+        stale = jnp.where(lower, 0, self.stale + count)
+        counts = self.evaluated + count, small, stale
+        return eqx.tree_at(lambda s: (s.evaluated, s.small, s.stale), self, counts)
+
+    def kept(self, points: Array, rows: Array, funs: Array, good: Array, count: int) -> Any:
+        """With these evaluations in the history instead of the oldest."""
+        room = self.history.keeping_best(count)
+        history = room.after(points, rows, funs, good, jnp.asarray(count))
+        return eqx.tree_at(lambda s: s.history, self, history)
+
+    def enough(self, count: int) -> Bool[Array, ""]:
+        """Whether half of the last so many evaluations gave numbers, once there are so many."""
+        return (self.evaluated < count) | self.history.mostly_valid(count)
+
+    def converged(self) -> Bool[Array, ""]:
+        """Whether the last steps were small."""
+        return self.small >= _SMALL
+
+    def is_local(self) -> Bool[Array, ""]:
+        """Whether a step within the trust region comes next."""
+        return self.stage == TRUST
+
+    def iterate(self) -> Float[Array, " n"]:
+        """The best point."""
+        return self.history.best(self.start)[0]
+
+
+def powers_of_two(count: int, dtype: Any) -> Float[Array, " count"]:
+    """1, 2, 1/2, 4, 1/4 ...: the radii of steps that are tried at once."""
+    return jnp.asarray([2.0 ** -((k + 1) // 2 * (-1) ** k) for k in range(count)], dtype)

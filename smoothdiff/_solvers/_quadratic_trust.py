@@ -1,0 +1,211 @@
+r"""Newton steps within a trust region, one evaluation a step: while a quadratic model predicts.
+
+Around the best point the function is modelled as $f + g \cdot u + \tfrac12 u \cdot H u$. The model
+interpolates the nearest evaluations, and its Hessian differs least, in Frobenius norm, from the
+last one. So 2 n + 1 evaluations are enough to begin with. The coordinates u are those in which the
+Hessian is round, as far as it is known: a narrow valley is as easy as a bowl.
+
+Source: the least change is Powell's (2004; NEWUOA, BOBYQA); the metric and the weights are our own.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from smoothdiff._params import Params
+from smoothdiff._solvers._base import dot
+from smoothdiff._solvers._bounded_step import bounded_step
+from smoothdiff._solvers._history import History
+from smoothdiff._solvers._metric import Metric
+from smoothdiff._solvers._point_search import powers_of_two
+
+# the most evaluations that a model interpolates, if n parameters do not need more
+_MOST = 256
+# how far they may be, in radii of the region or of the nearest 2 n + 1 of them
+_FARTHEST = 3.0
+# evaluations higher than so many times the median are interpolated less and less exactly
+_HIGH, _HIGHEST = 3.0, 1e6
+# the errors of the others, against the squared distances
+_RIDGE = {"float32": 1e-6, "float64": 1e-12}
+# the acceptance ratio of a step that fails, and of one after which the radius may grow
+_FAILED, _HELD = 0.1, 0.7
+# an evaluation so many radii away should make way for a nearer one
+_FAR = 2.0
+# so many steps that fail in a row, or evaluations for each parameter without a lower point, are too
+# many
+_FAILS, _SLOW = 5, 4
+# a radius of so many roundings is nothing
+_NOTHING = 32
+
+
+class Proposal(NamedTuple):
+    """Steps to evaluate, in units of the metric, and what the model says of them."""
+
+    steps: Float[Array, "K n"]
+    promised: Float[Array, " K"]
+    hessian: Float[Array, "n n"]
+    poor: Bool[Array, ""]
+
+
+class QuadraticTrust(eqx.Module):
+    """How far the model is trusted, in units of the metric, and the Hessian of the last model.
+
+    `improve` says that the next evaluation is for the geometry of the points, not for a step;
+    `fails` counts the steps in a row that failed, `slow` the evaluations without a lower point.
+    """
+
+    metric: Metric
+    radius: Float[Array, ""]
+    hessian: Float[Array, "n n"]
+    improve: Bool[Array, ""]
+    fails: Int[Array, ""]
+    slow: Int[Array, ""]
+
+    @staticmethod
+    def start(sigma: Float[Array, " n"], radius: Float[Array, ""]) -> "QuadraticTrust":
+        """Nothing is known of the function; the metric has sigma as its unit."""
+        n, none = len(sigma), jnp.zeros((), jnp.int32)
+        hessian = jnp.zeros((n, n), sigma.dtype)
+        return QuadraticTrust(
+            Metric.of(sigma, True), radius, hessian, jnp.asarray(False), none, none
+        )
+
+    def failed(self) -> Bool[Array, ""]:
+        """Whether the model is of no use here, or nothing is left to do for it."""
+        slow = self.slow >= _SLOW * (len(self.hessian) + 1)
+        small = self.radius <= _NOTHING * jnp.finfo(self.radius.dtype).eps
+        return (self.fails >= _FAILS) | slow | small
+
+    def revived(self, radius: Float[Array, ""]) -> "QuadraticTrust":
+        """Trusted again, at least as far as this, around another point."""
+        none = jnp.zeros_like(self.fails)
+        radius = jnp.maximum(self.radius, radius)
+        return QuadraticTrust(
+            self.metric, radius, self.hessian, jnp.zeros_like(self.improve), none, none
+        )
+
+    def propose(
+        self,
+        history: History,
+        center: Float[Array, " n"],
+        fun: Float[Array, ""],
+        params: Params,
+        count: int,
+    ) -> Proposal:
+        """Minimisers of the model within this radius and others, or a point for the geometry."""
+        grad, hessian, (constant, slope, bend), poor = self._fit(history, center, fun)
+
+        def minimiser(hessian: Array, grad: Array, radius: Array) -> Array:
+            return self._within_bounds(hessian, grad, radius, center, params)
+
+        radii = self.radius * powers_of_two(count, fun.dtype)
+        steps = jax.vmap(lambda radius: minimiser(hessian, grad, radius))(radii)
+        promised = -(dot(steps, grad) + jnp.sum(dot(steps, hessian) * steps, axis=1) / 2)
+        # where the model asks for nothing, a point that teaches it something: one of the two ends
+        # of what the farthest evaluation determines alone
+        improve = self.improve | ~(promised[0] > jnp.finfo(fun.dtype).eps * jnp.abs(fun))
+
+        def other() -> Array:
+            ends = jnp.stack([minimiser(s * bend, s * slope, self.radius) for s in (1, -1)])
+            moved = dot(ends, slope) + jnp.sum(dot(ends, bend) * ends, axis=1) / 2
+            return ends[jnp.argmax(jnp.abs(constant + moved))]
+
+        first = jax.lax.cond(improve, other, lambda: steps[0])
+        steps = steps.at[0].set(first)
+        promised = promised.at[0].set(jnp.where(improve, 0, promised[0]))
+        return Proposal(steps, promised, hessian, poor)
+
+    def _fit(
+        self, history: History, center: Array, fun: Array
+    ) -> tuple[Array, Array, tuple[Array, Array, Array], Array]:
+        """Gradient and Hessian; the polynomial of the farthest point, and whether that is too far.
+
+        The polynomial is 1 there and 0 at the other points, as far as they are interpolated.
+        """
+        n, dtype = len(center), fun.dtype
+        tiny = jnp.finfo(dtype).tiny
+        away = self.metric.into(history.points - center[None])
+        everywhere = jnp.where(history.valid, jnp.linalg.norm(away, axis=1), jnp.inf)
+        count = max(min((n + 1) * (n + 2) // 2, _MOST), 2 * n + 1)
+        nearest, near = jax.lax.top_k(-jnp.asarray(everywhere), min(count, len(away)))
+        distance = -jnp.asarray(nearest)
+        close = distance[: 2 * n + 1]
+        spread = jnp.max(jnp.where(jnp.isfinite(close), close, 0))
+        width = jnp.maximum(jnp.maximum(self.radius, spread), tiny)
+        used = distance <= _FARTHEST * width
+        a = jnp.where(used[:, None], away[near], 0) / width
+        rise = jnp.where(used, history.funs[near] - fun, 0)
+        typical = jnp.nanmedian(jnp.where(used, jnp.abs(rise), jnp.nan))
+        high = _HIGH * typical + tiny
+        above = jnp.clip(rise / high, 1, _HIGHEST)
+        rise = jnp.minimum(rise, _HIGHEST * high)
+
+        old = self.hessian * width**2
+        error = jnp.where(used, _RIDGE[dtype.name] * above**2, 1)
+        borders = jnp.concatenate([used[:, None].astype(dtype), a], axis=1)
+        corner = -jnp.finfo(dtype).eps * jnp.eye(n + 1, dtype=dtype)
+        kernel = dot(a, a.T) ** 2 / 2 + jnp.diag(error)
+        system = jnp.block([[kernel, borders], [borders.T, corner]])
+        farthest = jnp.argmax(jnp.where(used, distance, -1))
+        left = rise - jnp.sum(dot(a, old) * a, axis=1) / 2
+        sides = jnp.stack([jnp.where(used, left, 0), jnp.eye(len(a), dtype=dtype)[farthest]])
+        sides = jnp.pad(sides, ((0, 0), (0, n + 1)))
+        solved: Array = jnp.linalg.solve(system, sides.T).T
+        solved = jnp.asarray(jnp.where(jnp.all(jnp.isfinite(solved)), solved, 0))
+        bends = [dot(a.T * weights[None], a) for weights in solved[:, : len(a)]]
+        constants, slopes = solved[:, len(a)], solved[:, len(a) + 1 :] / width
+        polynomial = constants[1], slopes[1], bends[1] / width**2
+        poor = (distance[farthest] > _FAR * self.radius) & (jnp.sum(used) > n + 1)
+        return slopes[0], (old + bends[0]) / width**2, polynomial, poor
+
+    def _within_bounds(
+        self, hessian: Array, grad: Array, radius: Array, center: Array, params: Params
+    ) -> Array:
+        """The minimiser within the radius that leaves no bound."""
+        if params.low is None or params.high is None:
+            return bounded_step(hessian, grad, radius, None, None)
+        # the bounds are those of the parameters, in units of sigma
+        sigma = params.sigma
+        units = self.metric.into(jnp.diag(sigma))
+        bend, slope = dot(dot(units, hessian), units.T), dot(units, grad)
+        low, high = (params.low - center) / sigma, (params.high - center) / sigma
+        step = bounded_step(bend, slope, radius, low, high, dot(units, units.T))
+        return self.metric.into(params.clip(center + sigma * step) - center)
+
+    def revise(
+        self,
+        proposal: Proposal,
+        before: Float[Array, ""],
+        funs: Float[Array, " K"],
+        good: Bool[Array, " K"],
+    ) -> "QuadraticTrust":
+        """The region after these values came; its metric is that of the last Hessian."""
+        funs = jnp.where(good, funs, jnp.inf)
+        best = jnp.argmin(funs)
+        fun, promised = funs[best], proposal.promised[best]
+        hessian = proposal.hessian
+        metric, turn = self.metric.adapted(
+            lambda v: dot(hessian, v), jnp.diagonal(hessian), jnp.zeros_like(fun)
+        )
+        length = jnp.linalg.norm(turn.into(proposal.steps[best]))
+        tried = promised > 0
+        ratio = jnp.where(tried, (before - fun) / jnp.where(tried, promised, 1), 0)
+        failed = tried & ~(ratio > _FAILED)
+        fails = jnp.where(failed, self.fails + 1, jnp.where(tried, 0, self.fails))
+        # a model of far points is made better before it is trusted less
+        wait = proposal.poor & (fails < 2)
+        lower = jnp.minimum(self.radius, length) / 2
+        radius = jnp.where(failed & ~wait, lower, self.radius)
+        radius = jnp.where(tried & (ratio > _HELD), jnp.maximum(radius, 2 * length), radius)
+        radius = jnp.where(~tried & ~self.improve, self.radius / 2, radius)
+        return QuadraticTrust(
+            metric=metric,
+            radius=radius,
+            hessian=turn.out(turn.out(hessian).T),
+            improve=failed & proposal.poor,
+            fails=fails,
+            slow=jnp.where(fun < before, 0, self.slow + len(funs)).astype(fails.dtype),
+        )

@@ -1,0 +1,123 @@
+"""A Newton step from a regression over samples that are kept: where to sample next, how wide."""
+
+import math
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from smoothdiff._params import Params
+from smoothdiff._solvers._metric import Metric
+from smoothdiff._solvers._noisy_step import Trust, outcome, propose, revise
+from smoothdiff._solvers._scalar_fit import ScalarFit, fit
+
+# how strongly the noise of the Hessian's eigenvalues counts in the metric
+_CAUTION = 6.0
+# after so many steps in a row that lead nowhere, every second one goes back to the lowest sample,
+# with samples so much narrower
+_LOST, _NARROWER = 6, 0.6
+
+
+class Center(eqx.Module):
+    """Where samples are drawn, `theta`, and how: the metric, the width and the trust in them.
+
+    `accepted` is the last point that was better than the one before.
+    """
+
+    theta: Float[Array, " n"]
+    accepted: Float[Array, " n"]
+    metric: Metric
+    trust: Trust
+
+    @staticmethod
+    def start(theta: Float[Array, " n"], metric: Metric) -> "Center":
+        """Nothing is known, and the samples are as wide as the metric."""
+        return Center(theta, theta, metric, Trust.start(theta.size, theta.dtype))
+
+    def moved(self, theta: Float[Array, " n"]) -> "Center":
+        """The same samples, around another point."""
+        trust = self.trust
+        still = jnp.zeros_like(trust.promised), jnp.zeros_like(trust.quiet)
+        trust = eqx.tree_at(lambda t: (t.promised, t.quiet), trust, still)
+        return Center(theta, theta, self.metric, trust)
+
+    def sample(self, params: Params, z: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The sample for a standard normal point, within the bounds."""
+        return _bounded(params, self.metric, self.theta, z, self.trust.width, mirror=True)
+
+    def stepped(
+        self,
+        params: Params,
+        points: Float[Array, "m n"],
+        values: Float[Array, " m"],
+        valid: Bool[Array, " m"],
+        adaptive: bool,
+        small: Callable[[Array], Array] = lambda move: jnp.asarray(False),
+    ) -> tuple["Center", Float[Array, ""], Float[Array, ""]]:
+        """The next center; the smoothed function at this one, and its standard error.
+
+        `small` says whether a step is too small to lead anywhere.
+        """
+        theta, metric, trust = self.theta, self.metric, self.trust
+        model = fit(metric.into(points - theta[None]) / trust.width, values, valid)
+        before = metric.into(self.accepted - theta) / trust.width
+        good, ratio = outcome(model, before, trust.promised)
+        at, base = jnp.where(good, 0, before), jnp.where(good, theta, self.accepted)
+        turned, turn = _adapted(metric, model, at) if adaptive else (metric, metric.unit())
+
+        held = _held(params, base, metric.slope(model.grad(at)), trust.width * metric.widest())
+        hold = (lambda p: p) if held is None else turned.holding(held)
+
+        def confine(p: Array) -> Array:
+            if held is None:
+                return p
+            x = _bounded(params, turned, base, p, trust.width, mirror=False)
+            return turned.into(x - base) / trust.width
+
+        step = propose(model, at, turn, trust.radius, hold, confine)
+        x = params.clip(base + trust.width * turned.out(step.p))
+        if held is not None:
+            # to the last bit, or it would not be at its bound in the next step
+            x = jnp.where(held, base, x)
+
+        here = jnp.zeros_like(at)
+        known = jnp.where(valid, values, jnp.inf)
+        lowest = jnp.argmin(known)
+        # an estimate below all samples is an error of the model
+        value = jnp.maximum(model.value(here), known[lowest])
+        new = revise(trust, step, good, ratio, value, small(x - base), adaptive)
+        back = (new.quiet >= _LOST) & (new.quiet % 2 == 0) & adaptive
+        x, base = (jnp.where(back, points[lowest], a) for a in (x, base))
+        narrower = _NARROWER * trust.width, jnp.zeros_like(new.promised)
+        there = eqx.tree_at(lambda t: (t.width, t.promised), new, narrower)
+        new = jax.tree.map(lambda a, b: jnp.where(back, a, b), there, new)
+        return Center(x, base, turned, new), value, model.value_stderr(here)
+
+
+def _adapted(metric: Metric, model: ScalarFit, at: Array) -> tuple[Metric, Metric]:
+    """The metric of the model's Hessian, and the change to it."""
+    grad = model.grad(at)
+    size = jnp.linalg.norm(grad)
+    along = grad / jnp.maximum(size, jnp.finfo(grad.dtype).tiny)
+    noise = _CAUTION * math.sqrt(grad.size) * model.curvature_stderr(at, along)
+    return metric.adapted(model.curvature(at), model.curvature_diagonal(at), noise)
+
+
+def _bounded(
+    params: Params, metric: Metric, base: Array, u: Array, width: Array, mirror: bool
+) -> Array:
+    """The point u widths from `base`, within the bounds if there are any."""
+    if params.low is None or params.high is None:
+        return base + metric.out(width * u)
+    return metric.bounded(base, width * u, params.low, params.high, mirror)
+
+
+def _held(params: Params, x: Array, slope: Array, width: Array) -> Array | None:
+    """Which parameters are at a bound that the descent would cross; None without bounds."""
+    if params.low is None or params.high is None:
+        return None
+    # a step to a bound ends there but for rounding
+    near = 100 * jnp.finfo(x.dtype).eps * (jnp.abs(x) + width)
+    return ((x <= params.low + near) & (slope > 0)) | ((x >= params.high - near) & (slope < 0))

@@ -1,0 +1,239 @@
+"""One search for the minimum of one number: first points, a trust region, wide samples.
+
+The function is evaluated at the start and one sigma from it to both sides of each parameter. Then
+two models take turns. A local one, around the best point, needs one evaluation a step, and wins
+where the function is smooth. The other is a regression over samples around a center that moves; it
+wins where the function is rough. Whichever lowers the function faster goes on.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from smoothdiff._params import Params
+from smoothdiff._solvers._history import History
+from smoothdiff._solvers._metric import Metric
+from smoothdiff._solvers._point_search import FIRST, TRUST, WIDE, AbstractPointSearch, Sizes
+from smoothdiff._solvers._quadratic_trust import Proposal, QuadraticTrust
+from smoothdiff._solvers._regression_step import Center
+
+# evaluations for each parameter, and one, of a model's first turn, and of the other's test after it
+_TURN, _TEST = 6, 4
+# the other takes over if it lowers the function at this share of the rate: the later, the less
+# there is to gain
+_SHARE = 0.1
+# the widths of later searches, in sigma, as powers of ten at random
+_NARROWEST, _WIDEST = -1.5, 0.3
+
+
+class Turn(eqx.Module):
+    """Whose turn it is: `spent` evaluations of `length`, from the value `before`.
+
+    In a test, `rate` is by how much the other model lowered the function for each evaluation, in a
+    turn of `usual` length.
+    """
+
+    spent: Int[Array, ""]
+    length: Int[Array, ""]
+    usual: Int[Array, ""]
+    before: Float[Array, ""]
+    rate: Float[Array, ""]
+    test: Bool[Array, ""]
+
+
+class ValueSearch(AbstractPointSearch):
+    """Where a search stands, with the local model and the center of the wide samples."""
+
+    first_width: Float[Array, ""]
+    trust: QuadraticTrust
+    center: Center
+    taken: Int[Array, ""]
+    rounds: Int[Array, ""]
+    turn: Turn
+
+    @staticmethod
+    def of(
+        theta: Float[Array, " n"], sigma: Float[Array, " n"], width: Array, history: History
+    ) -> "ValueSearch":
+        """Nothing is known but what is in the history; the first samples are so wide."""
+        none, n = jnp.zeros((), jnp.int32), len(theta)
+        center = Center.start(theta, Metric.of(sigma, True))
+        center = eqx.tree_at(lambda c: c.trust.width, center, width)
+        length = jnp.asarray(_TURN * (n + 1), jnp.int32)
+        never = jnp.zeros_like(width)
+        return ValueSearch(
+            stage=jnp.asarray(FIRST, jnp.int32),
+            history=history,
+            start=theta,
+            evaluated=none,
+            small=none,
+            stale=none,
+            first_width=width,
+            trust=QuadraticTrust.start(sigma, width),
+            center=center,
+            taken=none,
+            rounds=none,
+            turn=Turn(none, length, length, never, never, jnp.asarray(False)),
+        )
+
+    def again(self, params: Params, theta: Float[Array, " n"], key: Array) -> "ValueSearch":
+        """Another search, from elsewhere, as wide as chance has it."""
+        empty = jax.tree.map(jnp.zeros_like, self.history)
+        power = jax.random.uniform(key, (), theta.dtype, _NARROWEST, _WIDEST)
+        anew = ValueSearch.of(theta, params.sigma, 10**power, empty)
+        return eqx.tree_at(lambda s: s.rounds, anew, self.rounds + 1)
+
+    def over(self, sizes: Sizes) -> Bool[Array, ""]:
+        """Whether neither model leads anywhere."""
+        return self.converged() | (_lost(self.center, sizes) & self.trust.failed())
+
+    def width(self) -> Float[Array, ""]:
+        """The radius, or the width of the samples."""
+        return jnp.where(self.stage == WIDE, self.center.trust.width, self.trust.radius)
+
+    def candidates(self) -> list[Float[Array, " n"]]:
+        """With noise, the lowest point owes much to luck, and the center little."""
+        return [self.center.theta]
+
+    def round(self) -> Int[Array, ""]:
+        """So many rounds of samples."""
+        return self.rounds
+
+    def smoothing(self) -> Float[Array, ""]:
+        """Half the trace of the model's Hessian."""
+        return jnp.trace(self.trust.hessian) * self.width() ** 2 / 2
+
+    def propose(
+        self, params: Params, draw: Callable[[int], Float[Array, "k n"]], sizes: Sizes
+    ) -> tuple[Float[Array, "K n"], Proposal]:
+        """The first points, the end of a step, or the next samples of a round."""
+        n, count = len(self.start), sizes.step
+        slot = jnp.arange(count, dtype=jnp.int32)
+        nothing = Proposal(
+            steps=jnp.zeros((count, n), self.start.dtype),
+            promised=jnp.zeros(count, self.start.dtype),
+            hessian=self.trust.hessian,
+            poor=jnp.asarray(False),
+        )
+
+        def first() -> tuple[Array, Proposal]:
+            unit = jnp.eye(n, dtype=self.start.dtype)
+            sides = jnp.stack([unit, -unit], axis=1).reshape(2 * n, n)
+            table = jnp.concatenate([0 * unit[:1], sides])
+            if count > 1:
+                table = jnp.concatenate([table, draw(count)])
+            at = jnp.minimum(self.evaluated + slot, len(table) - 1)
+            return self.start[None] + self.first_width * params.sigma[None] * table[at], nothing
+
+        def local() -> tuple[Array, Proposal]:
+            center, _, fun = self.history.best(self.start)
+            proposal = self.trust.propose(self.history, center, fun, params, count)
+            return center[None] + self.trust.metric.out(proposal.steps), proposal
+
+        def wide() -> tuple[Array, Proposal]:
+            z = draw(sizes.first)[jnp.minimum(self.taken + slot, sizes.first - 1)]
+            return jax.vmap(lambda z: self.center.sample(params, z))(z), nothing
+
+        return jax.lax.switch(self.stage, [first, local, wide])
+
+    def after(
+        self,
+        params: Params,
+        points: Float[Array, "K n"],
+        rows: Float[Array, "K P"],
+        funs: Float[Array, " K"],
+        good: Bool[Array, " K"],
+        proposal: Proposal,
+        sizes: Sizes,
+    ) -> "ValueSearch":
+        """The search with these values at these points."""
+        before = self.history.best(self.start)[2]
+        known = self.kept(points, rows, funs, good, sizes.step)
+        known = eqx.tree_at(lambda s: s.turn.spent, known, self.turn.spent + sizes.step)
+
+        def first() -> "ValueSearch":
+            enough = self.evaluated + sizes.step > 2 * len(self.start)
+            stage = jnp.where(enough, TRUST, FIRST).astype(self.stage.dtype)
+            turn = jnp.zeros_like(self.turn.spent), known.history.best(self.start)[2]
+            return eqx.tree_at(
+                lambda s: (s.stage, s.turn.spent, s.turn.before), known, (stage, *turn)
+            )
+
+        def local() -> "ValueSearch":
+            trust = self.trust.revise(proposal, before, funs, good)
+            return eqx.tree_at(lambda s: s.trust, known, trust)._turned(sizes)
+
+        def wide() -> "ValueSearch":
+            taken = self.taken + sizes.step
+            more = eqx.tree_at(lambda s: s.taken, known, taken)
+            full = lambda: known._stepped(params)._turned(sizes)
+            return jax.lax.cond(taken >= sizes.first, full, lambda: more)
+
+        return jax.lax.switch(self.stage, [first, local, wide])
+
+    def _stepped(self, params: Params) -> "ValueSearch":
+        """The next center, from all samples."""
+        history = self.history
+        center, *_ = self.center.stepped(
+            params, history.points, history.funs, history.valid, adaptive=True
+        )
+        finite = jnp.all(jnp.isfinite(center.theta)) & jnp.isfinite(center.trust.width)
+        center = jax.tree.map(lambda a, b: jnp.where(finite, a, b), center, self.center)
+        none = jnp.zeros_like(self.taken)
+        new = center, none, self.rounds + 1
+        return eqx.tree_at(lambda s: (s.center, s.taken, s.rounds), self, new)
+
+    def _turned(self, sizes: Sizes) -> "ValueSearch":
+        """The other model's turn, if this one's is over."""
+        turn, local = self.turn, self.is_local()
+        point, _, fun = self.history.best(self.start)
+        rate = (turn.before - fun) / jnp.maximum(turn.spent, 1).astype(fun.dtype)
+        lower = rate > 0
+        ended = turn.spent >= turn.length
+        ended |= jnp.where(local, self.trust.failed(), _lost(self.center, sizes))
+
+        # what one has found the other begins with
+        revive = ~local & lower & self.trust.failed()
+        trust = jax.tree.map(
+            lambda a, b: jnp.where(revive, a, b),
+            self.trust.revived(self.center.trust.width),
+            self.trust,
+        )
+        move = local & (lower | (self.rounds == 0))
+        center = jax.tree.map(
+            lambda a, b: jnp.where(move, a, b), self.center.moved(point), self.center
+        )
+        done = jnp.stack([trust.failed(), _lost(center, sizes)])
+        here = jnp.where(local, 0, 1)
+        other = 1 - here
+        wins = turn.test & ((rate > _SHARE * turn.rate) | done[other])
+        stays = wins & ~done[here]
+        first = jnp.full_like(turn.usual, _TURN * (len(self.start) + 1))
+        usual = jnp.where(turn.test, jnp.where(wins, first, 2 * turn.usual), turn.usual)
+        follows = jnp.where(stays, here, other)
+        skipped = done[follows]
+        follows = jnp.where(skipped, 1 - follows, follows)
+        test = ~turn.test & ~skipped
+        usual = jnp.where(skipped, first, usual)
+        short = jnp.full_like(usual, _TEST * (len(self.start) + 1))
+        after = Turn(
+            spent=jnp.zeros_like(turn.spent),
+            length=jnp.where(test, short, usual),
+            usual=usual,
+            before=fun,
+            rate=rate,
+            test=test,
+        )
+        stage = jnp.where(follows == 0, TRUST, WIDE).astype(self.stage.dtype)
+        turned = eqx.tree_at(
+            lambda s: (s.stage, s.trust, s.center, s.turn), self, (stage, trust, center, after)
+        )
+        return jax.tree.map(lambda a, b: jnp.where(ended, a, b), turned, self)
+
+
+def _lost(center: Center, sizes: Sizes) -> Bool[Array, ""]:
+    """Whether the rounds of the wide samples led nowhere for as long as one has patience."""
+    return center.trust.quiet * sizes.first >= sizes.patience
