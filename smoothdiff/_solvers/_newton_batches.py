@@ -130,7 +130,13 @@ def step(
             return length < solver.atol + solver.rtol * solver.norm(y)
 
     after, value, stderr = center.stepped(
-        params, history.points, history.funs, history.valid, adaptive, small
+        params,
+        history.points,
+        history.funs,
+        history.valid,
+        adaptive,
+        returns=jnp.asarray(False),
+        small=small,
     )
     new_y = params.layout.tree(after.theta)
     finite = all_finite((batch.values if batch.valid is None else batch.scale, after.theta))

@@ -99,7 +99,8 @@ def step(
         lowest_theta = params.layout.vector(jax.tree.leaves(progress.lowest_y))
         place, other = jax.random.split(jax.random.fold_in(key, progress.evaluations))
         theta = _anywhere(params, place, lowest_theta)
-        anew = after.again(params, theta, other)
+        start = params.layout.vector(jax.tree.leaves(progress.start_y))
+        anew = after.again(params, theta, start, other)
         new_y, after = jax.tree.map(
             lambda a, b: jnp.where(again, a, b), (params.layout.tree(theta), anew), (new_y, after)
         )

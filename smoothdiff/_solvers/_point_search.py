@@ -15,6 +15,8 @@ from smoothdiff._solvers._history import History
 FIRST, TRUST, WIDE = 0, 1, 2
 # so many small steps in a row count as convergence
 _SMALL = 3
+# a width of so many roundings of sigma is nothing
+_NOTHING = 32
 
 
 class Sizes(NamedTuple):
@@ -44,8 +46,10 @@ class AbstractPointSearch(eqx.Module):
     stale: Int[Array, ""]
 
     @abc.abstractmethod
-    def again(self, params: Params, theta: Float[Array, " n"], key: Array) -> "AbstractPointSearch":
-        """Another search, from elsewhere, with other random numbers."""
+    def again(
+        self, params: Params, theta: Float[Array, " n"], start: Float[Array, " n"], key: Array
+    ) -> "AbstractPointSearch":
+        """Another search, from elsewhere or from where the run began, with other random numbers."""
 
     @abc.abstractmethod
     def width(self) -> Float[Array, ""]:
@@ -122,3 +126,8 @@ class AbstractPointSearch(eqx.Module):
 def powers_of_two(count: int, dtype: Any) -> Float[Array, " count"]:
     """1, 2, 1/2, 4, 1/4 ...: the radii of steps that are tried at once."""
     return jnp.asarray([2.0 ** -((k + 1) // 2 * (-1) ** k) for k in range(count)], dtype)
+
+
+def nothing(width: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether a width, relative to sigma, is so small that the function cannot be told apart."""
+    return width <= _NOTHING * jnp.finfo(width.dtype).eps

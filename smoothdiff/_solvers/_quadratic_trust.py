@@ -16,11 +16,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
-from smoothdiff._solvers._base import dot
+from smoothdiff._solvers._base import all_finite, dot
 from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._metric import Metric
-from smoothdiff._solvers._point_search import powers_of_two
+from smoothdiff._solvers._point_search import nothing, powers_of_two
 
 # the most evaluations that a model interpolates, if n parameters do not need more
 _MOST = 256
@@ -37,8 +37,6 @@ _FAR = 2.0
 # so many steps that fail in a row, or evaluations for each parameter without a lower point, are too
 # many
 _FAILS, _SLOW = 5, 4
-# a radius of so many roundings is nothing
-_NOTHING = 32
 
 
 class Proposal(NamedTuple):
@@ -76,8 +74,7 @@ class QuadraticTrust(eqx.Module):
     def failed(self) -> Bool[Array, ""]:
         """Whether the model is of no use here, or nothing is left to do for it."""
         slow = self.slow >= _SLOW * (len(self.hessian) + 1)
-        small = self.radius <= _NOTHING * jnp.finfo(self.radius.dtype).eps
-        return (self.fails >= _FAILS) | slow | small
+        return (self.fails >= _FAILS) | slow | nothing(self.radius)
 
     def revived(self, radius: Float[Array, ""]) -> "QuadraticTrust":
         """Trusted again, at least as far as this, around another point."""
@@ -189,6 +186,11 @@ class QuadraticTrust(eqx.Module):
         hessian = proposal.hessian
         metric, turn = self.metric.adapted(
             lambda v: dot(hessian, v), jnp.diagonal(hessian), jnp.zeros_like(fun)
+        )
+        usable = all_finite((metric, turn))
+        still = Metric.of(jnp.ones_like(proposal.steps[0]), True)
+        metric, turn = jax.tree.map(
+            lambda a, b: jnp.where(usable, a, b), (metric, turn), (self.metric, still)
         )
         length = jnp.linalg.norm(turn.into(proposal.steps[best]))
         tried = promised > 0

@@ -54,10 +54,12 @@ class Center(eqx.Module):
         values: Float[Array, " m"],
         valid: Bool[Array, " m"],
         adaptive: bool,
+        returns: Bool[Array, ""],
         small: Callable[[Array], Array] = lambda move: jnp.asarray(False),
     ) -> tuple["Center", Float[Array, ""], Float[Array, ""]]:
         """The next center; the smoothed function at this one, and its standard error.
 
+        It `returns` to the lowest sample from a step that led nowhere, or not.
         `small` says whether a step is too small to lead anywhere.
         """
         theta, metric, trust = self.theta, self.metric, self.trust
@@ -88,7 +90,7 @@ class Center(eqx.Module):
         # an estimate below all samples is an error of the model
         value = jnp.maximum(model.value(here), known[lowest])
         new = revise(trust, step, good, ratio, value, small(x - base), adaptive)
-        back = (new.quiet >= _LOST) & (new.quiet % 2 == 0) & adaptive
+        back = (new.quiet >= _LOST) & (new.quiet % 2 == 0) & returns
         x, base = (jnp.where(back, points[lowest], a) for a in (x, base))
         narrower = _NARROWER * trust.width, jnp.zeros_like(new.promised)
         there = eqx.tree_at(lambda t: (t.width, t.promised), new, narrower)

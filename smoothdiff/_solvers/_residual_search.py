@@ -48,7 +48,9 @@ class ResidualSearch(AbstractPointSearch):
             stale=none,
         )
 
-    def again(self, params: Params, theta: Float[Array, " n"], key: Array) -> "ResidualSearch":
+    def again(
+        self, params: Params, theta: Float[Array, " n"], start: Float[Array, " n"], key: Array
+    ) -> "ResidualSearch":
         """Another search, from elsewhere, with other random numbers."""
         empty = jax.tree.map(jnp.zeros_like, self.history)
         anew = ResidualSearch.of(theta, empty)

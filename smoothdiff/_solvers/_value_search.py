@@ -14,9 +14,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
+from smoothdiff._solvers._base import all_finite
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._metric import Metric
-from smoothdiff._solvers._point_search import FIRST, TRUST, WIDE, AbstractPointSearch, Sizes
+from smoothdiff._solvers._point_search import (
+    FIRST,
+    TRUST,
+    WIDE,
+    AbstractPointSearch,
+    Sizes,
+    nothing,
+)
 from smoothdiff._solvers._quadratic_trust import Proposal, QuadraticTrust
 from smoothdiff._solvers._regression_step import Center
 
@@ -45,9 +53,14 @@ class Turn(eqx.Module):
 
 
 class ValueSearch(AbstractPointSearch):
-    """Where a search stands, with the local model and the center of the wide samples."""
+    """Where a search stands, with the local model and the center of the wide samples.
+
+    A `patient` search is the wide model's alone, and never goes back to the lowest sample: what is
+    lowest by chance does not lead it away from where the smoothed function is low.
+    """
 
     first_width: Float[Array, ""]
+    patient: Bool[Array, ""]
     trust: QuadraticTrust
     center: Center
     taken: Int[Array, ""]
@@ -72,6 +85,7 @@ class ValueSearch(AbstractPointSearch):
             small=none,
             stale=none,
             first_width=width,
+            patient=jnp.asarray(False),
             trust=QuadraticTrust.start(sigma, width),
             center=center,
             taken=none,
@@ -79,16 +93,23 @@ class ValueSearch(AbstractPointSearch):
             turn=Turn(none, length, length, never, never, jnp.asarray(False)),
         )
 
-    def again(self, params: Params, theta: Float[Array, " n"], key: Array) -> "ValueSearch":
-        """Another search, from elsewhere, as wide as chance has it."""
+    def again(
+        self, params: Params, theta: Float[Array, " n"], start: Float[Array, " n"], key: Array
+    ) -> "ValueSearch":
+        """Another search: in turns a patient one at the start, and one elsewhere, of any width."""
         empty = jax.tree.map(jnp.zeros_like, self.history)
+        here = ~self.patient
         power = jax.random.uniform(key, (), theta.dtype, _NARROWEST, _WIDEST)
-        anew = ValueSearch.of(theta, params.sigma, 10**power, empty)
-        return eqx.tree_at(lambda s: s.rounds, anew, self.rounds + 1)
+        theta, width = jnp.where(here, start, theta), jnp.where(here, 1, 10**power)
+        anew = ValueSearch.of(theta, params.sigma, width, empty)
+        stage = jnp.where(here, WIDE, FIRST).astype(self.stage.dtype)
+        changed = stage, self.rounds + 1, here
+        return eqx.tree_at(lambda s: (s.stage, s.rounds, s.patient), anew, changed)
 
     def over(self, sizes: Sizes) -> Bool[Array, ""]:
         """Whether neither model leads anywhere."""
-        return self.converged() | (_lost(self.center, sizes) & self.trust.failed())
+        lost = _lost(self.center, sizes) & (self.trust.failed() | self.patient)
+        return self.converged() | lost
 
     def width(self) -> Float[Array, ""]:
         """The radius, or the width of the samples."""
@@ -178,9 +199,10 @@ class ValueSearch(AbstractPointSearch):
         """The next center, from all samples."""
         history = self.history
         center, *_ = self.center.stepped(
-            params, history.points, history.funs, history.valid, adaptive=True
+            params, history.points, history.funs, history.valid, True, ~self.patient
         )
-        finite = jnp.all(jnp.isfinite(center.theta)) & jnp.isfinite(center.trust.width)
+        # a metric can overflow where the function is flat
+        finite = all_finite((center.theta, center.metric, center.trust.width))
         center = jax.tree.map(lambda a, b: jnp.where(finite, a, b), center, self.center)
         none = jnp.zeros_like(self.taken)
         new = center, none, self.rounds + 1
@@ -194,22 +216,24 @@ class ValueSearch(AbstractPointSearch):
         lower = rate > 0
         ended = turn.spent >= turn.length
         ended |= jnp.where(local, self.trust.failed(), _lost(self.center, sizes))
+        ended &= ~self.patient
 
-        # what one has found the other begins with
+        # what one has found the other begins with, unless it found little
+        little = turn.test & (rate <= _SHARE * turn.rate)
         revive = ~local & lower & self.trust.failed()
         trust = jax.tree.map(
             lambda a, b: jnp.where(revive, a, b),
             self.trust.revived(self.center.trust.width),
             self.trust,
         )
-        move = local & (lower | (self.rounds == 0))
+        move = local & ((lower & ~little) | (self.rounds == 0))
         center = jax.tree.map(
             lambda a, b: jnp.where(move, a, b), self.center.moved(point), self.center
         )
         done = jnp.stack([trust.failed(), _lost(center, sizes)])
         here = jnp.where(local, 0, 1)
         other = 1 - here
-        wins = turn.test & ((rate > _SHARE * turn.rate) | done[other])
+        wins = turn.test & (~little | done[other])
         stays = wins & ~done[here]
         first = jnp.full_like(turn.usual, _TURN * (len(self.start) + 1))
         usual = jnp.where(turn.test, jnp.where(wins, first, 2 * turn.usual), turn.usual)
@@ -235,5 +259,6 @@ class ValueSearch(AbstractPointSearch):
 
 
 def _lost(center: Center, sizes: Sizes) -> Bool[Array, ""]:
-    """Whether the rounds of the wide samples led nowhere for as long as one has patience."""
-    return center.trust.quiet * sizes.first >= sizes.patience
+    """Whether rounds of wide samples led nowhere for too long, or have no width any more."""
+    trust = center.trust
+    return (trust.quiet * sizes.first >= sizes.patience) | nothing(trust.width)

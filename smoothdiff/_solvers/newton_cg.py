@@ -1,5 +1,6 @@
 """Newton's method on a number that need not be differentiable, from function values alone."""
 
+import math
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -19,8 +20,9 @@ from smoothdiff._solvers._value_search import ValueSearch
 
 # from so many parameters on, evaluations come in batches
 _MANY = 100
-# the fewest samples of a round, and the fewest and the most evaluations that are kept by default
-_ROUND, _FEWEST, _MOST = 4, 40, 512
+# the fewest and the most samples of a round by default, and evaluations that are kept
+_FEW, _SOME = 4, 16
+_FEWEST, _MOST = 40, 512
 
 
 class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
@@ -73,10 +75,10 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         patience: a search ends after so many evaluations in a row in which the wide model led
             nowhere, if the local one does not either; by default 20 (n + 1). With batches it counts
             steps, by default 30.
-        restarts: how many searches may follow: for functions with several minima. They begin
-            anywhere within the bounds, without bounds around the best point so far, and as wide as
-            chance has it. With batches they begin at the first point. The best point of all is
-            returned.
+        restarts: how many searches may follow: for functions with several minima. In turns one
+            begins at the first point with wide samples alone, and one anywhere within the bounds,
+            without bounds around the best point so far, as wide as chance has it. With batches all
+            begin at the first point. The best point of all is returned.
 
     Raises:
         ValueError: no evaluation in a step, fewer kept ones than two, a patience of none, negative
@@ -149,7 +151,8 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
 
     def _sizes(self, y: PyTree[Array]) -> Sizes:
         n = sum(leaf.size for leaf in jax.tree.leaves(y))
-        count = max(self.num_samples or 1, _ROUND)
+        # about one for each parameter; Sobol points are balanced if they are a power of two
+        count = self.num_samples or 2 ** int(math.log2(min(max(n, _FEW), _SOME)))
         patience = self.patience or _point_by_point.PATIENCE * (n + 1)
         return Sizes(self.num_samples or 1, count, count, patience)
 
