@@ -29,7 +29,7 @@ _FARTHEST = 3.0
 # evaluations higher than so many times the median are interpolated less and less exactly
 _HIGH, _HIGHEST = 3.0, 1e6
 # the errors of the others, against the squared distances
-_RIDGE = {"float32": 1e-6, "float64": 1e-12}
+_RIDGE = {"float32": 1e-7, "float64": 1e-12}
 # the acceptance ratio of a step that fails, and of one after which the radius may grow
 _FAILED, _HELD = 0.1, 0.7
 # an evaluation so many radii away should make way for a nearer one
@@ -131,8 +131,10 @@ class QuadraticTrust(eqx.Module):
         distance = -jnp.asarray(nearest)
         close = distance[: 2 * n + 1]
         spread = jnp.max(jnp.where(jnp.isfinite(close), close, 0))
-        width = jnp.maximum(jnp.maximum(self.radius, spread), tiny)
-        used = distance <= _FARTHEST * width
+        reach = jnp.maximum(self.radius, spread)
+        used = distance <= _FARTHEST * reach
+        # so that the kernel is about 1, beside which the errors are small
+        width = jnp.minimum(reach, jnp.max(jnp.where(used, distance, 0))) + tiny
         a = jnp.where(used[:, None], away[near], 0) / width
         rise = jnp.where(used, history.funs[near] - fun, 0)
         typical = jnp.nanmedian(jnp.where(used, jnp.abs(rise), jnp.nan))
@@ -150,7 +152,11 @@ class QuadraticTrust(eqx.Module):
         left = rise - jnp.sum(dot(a, old) * a, axis=1) / 2
         sides = jnp.stack([jnp.where(used, left, 0), jnp.eye(len(a), dtype=dtype)[farthest]])
         sides = jnp.pad(sides, ((0, 0), (0, n + 1)))
-        solved: Array = jnp.linalg.solve(system, sides.T).T
+        factor = jax.scipy.linalg.lu_factor(system)
+        solved = jax.scipy.linalg.lu_solve(factor, sides.T)
+        # once more for what rounding left, which is much in float32
+        solved += jax.scipy.linalg.lu_solve(factor, sides.T - dot(system, solved))
+        solved = solved.T
         solved = jnp.asarray(jnp.where(jnp.all(jnp.isfinite(solved)), solved, 0))
         bends = [dot(a.T * weights[None], a) for weights in solved[:, : len(a)]]
         constants, slopes = solved[:, len(a)], solved[:, len(a) + 1 :] / width

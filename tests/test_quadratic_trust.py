@@ -1,0 +1,138 @@
+"""The quadratic model within a trust region that Newton-CG uses point by point."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from smoothdiff._params import take_apart
+from smoothdiff._solvers._bounded_step import bounded_step
+from smoothdiff._solvers._history import History
+from smoothdiff._solvers._quadratic_trust import QuadraticTrust
+
+N = 3
+ROOT = np.random.default_rng(0).normal(size=(N, N))
+HESSIAN = ROOT @ ROOT.T + np.eye(N)
+BEST = np.array([0.3, -0.2, 0.5])
+
+
+def bowl(x):
+    return 2.0 + (x - BEST) @ HESSIAN @ (x - BEST) / 2
+
+
+def known(points, fun=bowl):
+    """A history of the function at these points."""
+    points = jnp.asarray(np.asarray(points))
+    funs = jnp.asarray([fun(np.asarray(x)) for x in points])
+    empty = History.empty(40, N, 1, points.dtype)
+    good, count = jnp.ones(len(points), bool), jnp.asarray(len(points))
+    return empty.after(points, funs[:, None], funs, good, count)
+
+
+def around(count, width=1.0):
+    first = [np.zeros(N), *np.eye(N), *-np.eye(N)]
+    more = np.random.default_rng(1).normal(size=(20, N))
+    return width * np.array([*first, *more][:count])
+
+
+def proposal_of(history, radius=10.0, bounds=None, count=1):
+    params = take_apart(jnp.zeros(N), jnp.ones(N), bounds)
+    trust = QuadraticTrust.start(params.sigma, jnp.asarray(radius))
+    center, _, fun = history.best(jnp.zeros(N))
+    proposal = trust.propose(history, center, fun, params, count)
+    return trust, proposal, np.asarray(center), float(fun)
+
+
+@pytest.mark.parametrize("width", [1.0, 1e-6, 1e6])
+def test_ten_points_determine_a_quadratic_in_three_dimensions(x64, width):
+    history = known(around(10, width), lambda x: bowl(x / width))
+    _, proposal, center, fun = proposal_of(history, 10 * width)
+    np.testing.assert_allclose(proposal.hessian * width**2, HESSIAN, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(center + proposal.steps[0], BEST * width, rtol=1e-3)
+    assert proposal.promised[0] == pytest.approx(fun - 2, rel=1e-3)
+
+
+def test_two_n_plus_one_points_give_the_gradient_and_the_diagonal(x64):
+    _, proposal, *_ = proposal_of(known(around(2 * N + 1)))
+    np.testing.assert_allclose(np.diag(proposal.hessian), np.diag(HESSIAN), rtol=1e-6)
+    # of the other entries nothing is known, and nothing is made up
+    assert np.max(np.abs(proposal.hessian - np.diag(np.diag(proposal.hessian)))) < 0.5
+
+
+def test_one_value_that_is_huge_does_not_spoil_the_model(x64):
+    points = np.concatenate([around(15), np.full((1, N), 2.0)])
+    fun = lambda x: 1e30 if np.all(x == 2) else bowl(x)
+    _, proposal, center, _ = proposal_of(known(points, fun))
+    np.testing.assert_allclose(center + proposal.steps[0], BEST, atol=1e-2)
+
+
+def test_bounds_hold_and_the_rest_is_minimised(x64):
+    high = jnp.array([0.1, 9.0, 9.0])
+    _, proposal, center, _ = proposal_of(known(around(10)), bounds=(-9 * jnp.ones(N), high))
+    found = center + proposal.steps[0]
+    rest = np.linalg.solve(HESSIAN[1:, 1:], -HESSIAN[1:, 0] * (0.1 - BEST[0])) + BEST[1:]
+    np.testing.assert_allclose(found, [0.1, *rest], atol=1e-4)
+
+
+def test_several_steps_at_once_have_several_radii(x64):
+    _, proposal, *_ = proposal_of(known(around(10)), radius=0.01, count=3)
+    lengths = np.linalg.norm(proposal.steps, axis=1)
+    np.testing.assert_allclose(lengths, [0.01, 0.02, 0.005], rtol=1e-6)
+
+
+def test_the_radius_follows_the_ratio_and_the_metric_the_hessian(x64):
+    trust, proposal, _, fun = proposal_of(known(around(10, 0.05)), radius=0.05)
+    good = jnp.ones(1, bool)
+    outcome = lambda value: trust.revise(proposal, jnp.asarray(fun), jnp.asarray([value]), good)
+    kept = outcome(fun - float(proposal.promised[0]))
+    assert kept.radius > 0.06
+    assert outcome(fun + 1).radius < 0.03
+    assert outcome(np.inf).fails == 1
+    # towards the shape in which the Hessian is round
+    before, after = (np.linalg.cond(h) for h in (proposal.hessian, kept.hessian))
+    assert after < before
+
+
+def test_it_has_failed_after_five_failures_in_a_row_or_without_a_radius(x64):
+    trust, proposal, _, fun = proposal_of(known(around(10)))
+    for _ in range(5):
+        assert not trust.failed()
+        trust = trust.revise(proposal, jnp.asarray(fun), jnp.asarray([fun + 1]), jnp.ones(1, bool))
+    assert trust.failed()
+    assert not trust.revived(jnp.asarray(1.0)).failed()
+    assert QuadraticTrust.start(jnp.ones(N), jnp.asarray(1e-16)).failed()
+
+
+def test_where_the_model_is_flat_the_step_is_for_the_geometry(x64):
+    _, proposal, *_ = proposal_of(known(around(7), lambda x: 1.0), radius=0.5)
+    assert proposal.promised[0] == 0
+    assert np.linalg.norm(proposal.steps[0]) == pytest.approx(0.5, rel=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_shape_is_a_change_of_coordinates(x64, seed):
+    rng = np.random.default_rng(seed)
+    hessian, grad, root = rng.normal(size=(N, N)), rng.normal(size=N), rng.normal(size=(N, N))
+    hessian, root = hessian + hessian.T, root + 3 * np.eye(N)
+    inverse = np.linalg.inv(root)
+    turned = inverse @ hessian @ inverse.T, inverse @ grad
+    hessian, grad, shape, *turned = map(jnp.asarray, (hessian, grad, root @ root.T, *turned))
+    far, radius = jnp.full(N, 1e6), jnp.asarray(0.7)
+    shaped = bounded_step(hessian, grad, radius, -far, far, shape)
+    round_ = bounded_step(*turned, radius, None, None)
+    np.testing.assert_allclose(root.T @ shaped, round_, rtol=1e-4, atol=1e-6)
+
+
+def test_it_works_in_float32_and_under_vmap():
+    history = known(around(10).astype(np.float32))
+    params = take_apart(jnp.zeros(N), jnp.ones(N), None)
+    center, _, fun = history.best(jnp.zeros(N))
+
+    def step(radius):
+        trust = QuadraticTrust.start(params.sigma, radius)
+        return trust.propose(history, center, fun, params, 1).steps[0]
+
+    steps = jax.jit(jax.vmap(step))(jnp.array([0.1, 10.0]))
+    assert steps.dtype == jnp.float32
+    np.testing.assert_allclose(center + steps[1], BEST, atol=1e-3)
+    assert np.linalg.norm(steps[0]) == pytest.approx(0.1, rel=1e-3)
