@@ -167,7 +167,7 @@ def test_transformations_that_ask_for_the_value_get_it():
     assert optax.tree.get(solution.state.opt_state, "scale") < 1
     assert solution.result == SUCCESS
     assert 20 < solution.stats["num_steps"] < 200
-    assert solution.state.quiet == 5
+    assert solution.state.stall == 5
     assert not np.array_equal(solution.aux["y"], solution.value)
     np.testing.assert_allclose(solution.aux["y"], TARGET, atol=0.05)
 

@@ -117,7 +117,7 @@ def outcome(fun, trust=None, predicted=0.5):
     proposal = Proposal(
         steps=one,
         predicted=predicted * one,
-        promised=(1 - predicted**2) / 2 * jnp.ones(1),
+        reduction=(1 - predicted**2) / 2 * jnp.ones(1),
         slope=jnp.ones(1),
         jacobian=one,
         poor=jnp.asarray(False),

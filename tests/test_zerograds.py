@@ -445,7 +445,7 @@ def test_a_module_that_is_already_made_is_used_as_it_is():
     assert solution.stats["fun"] < 0.1
     assert solution.result == SUCCESS
     assert 20 < solution.stats["num_steps"] < 250
-    assert solution.state.quiet == 5
+    assert solution.state.stall == 5
     # of the last step: sigma is 0.3
     np.testing.assert_allclose(solution.aux["y"], TARGET, atol=1.2)
 

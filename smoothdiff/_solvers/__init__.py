@@ -5,7 +5,7 @@ object runs inside `optimistix.minimise(fun, solver, y0, options={"key": key})` 
 iterates, one step at a time under `smoothdiff.minimise`. What both rely on:
 
 * The options are `"key"` and, optionally, `"bounds"` (`read_options`). The random numbers of a step
-  come from `jax.random.fold_in(key, progress.step)` and from nothing else.
+  come from the key, folded with counters of the state, and from nothing else.
 * The state is an `eqx.Module` of arrays, of the same shapes and dtypes at every step, with a field
   `progress: Progress`. No typed keys, Python numbers or operators are in it.
 * `init` evaluates nothing. `sd.minimise` calls it with concrete values: it refuses bad ones.

@@ -78,13 +78,13 @@ def _within(
 ) -> Array:
     """The minimiser over the ball, of the free parameters alone."""
     size = jnp.arange(len(grad))
-    both, held = free[:, None] & free[None], jnp.where(free, 0, 1)
-    hessian = jnp.where(both, hessian, 0).at[size, size].add(held)
+    both, active = free[:, None] & free[None], jnp.where(free, 0, 1)
+    hessian = jnp.where(both, hessian, 0).at[size, size].add(active)
     grad = jnp.where(free, grad, 0)
     if shape is None:
         return jnp.where(free, _within_ball(hessian, grad, radius), 0)
     # in coordinates in which the shape is a ball
-    root = _inverse_root(jnp.where(both, shape, 0).at[size, size].add(held))
+    root = _inverse_root(jnp.where(both, shape, 0).at[size, size].add(active))
     step = _within_ball(dot(dot(root, hessian), root.T), dot(root, grad), radius)
     return jnp.where(free, dot(root.T, step), 0)
 

@@ -86,11 +86,11 @@ class Metric(eqx.Module):
         """The gradient in the parameters from that in units of the width."""
         return _apply(self.inverse.T, grad)
 
-    def holding(self, held: Bool[Array, " n"]) -> Callable[[Array], Array]:
-        """Takes from a step, in units of the width, what would move parameters that are held."""
+    def holding(self, active: Bool[Array, " n"]) -> Callable[[Array], Array]:
+        """Takes from a step, in units of the width, what would move parameters that are active."""
         if self.matrix.ndim == 1:
-            return lambda u: jnp.where(held, 0, u)
-        rows = jnp.where(held[:, None], self.matrix, 0)
+            return lambda u: jnp.where(active, 0, u)
+        rows = jnp.where(active[:, None], self.matrix, 0)
         inverse = jnp.linalg.pinv(rows)
 
         def hold(u: Array) -> Array:

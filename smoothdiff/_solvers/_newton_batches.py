@@ -59,7 +59,7 @@ def final_evaluations(solver: Any, y: PyTree[Array]) -> int:
 
 def over(solver: Any, state: NewtonBatchState) -> Array:
     """Whether so many steps in a row led nowhere."""
-    return state.center.trust.quiet >= (solver.patience or _PATIENCE)
+    return state.center.trust.stall >= (solver.patience or _PATIENCE)
 
 
 def _metric(solver: Any, metric: Metric, params: Params) -> Metric:
@@ -148,9 +148,9 @@ def step(
         lowest = progress.best_fun < state.progress.best_fun
         restarts = restarts.after(lowest, (metric, center.trust.width))
         first = _first(solver, params, restarts.theta), jax.tree.map(jnp.zeros_like, history)
-        quiet = going[1].trust.quiet >= (solver.patience or _PATIENCE)
+        stall = going[1].trust.stall >= (solver.patience or _PATIENCE)
         start = params.layout.tree(restarts.theta)
-        going, restarts = restarts.next(quiet, going, (start, *first))
+        going, restarts = restarts.next(stall, going, (start, *first))
     new_y, after, history = going
     # the function was never evaluated at y itself, so its aux is that of a sample near y
     return new_y, NewtonBatchState(progress, after, history, restarts), seen.aux

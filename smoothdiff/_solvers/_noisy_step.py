@@ -12,14 +12,14 @@ from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._scalar_fit import ScalarFit
 from smoothdiff._solvers._trust_region import truncated_cg
 
-# a step is taken if the function falls by this share of what the model promised
+# a step is taken if the function falls by this share of the predicted reduction
 _ACCEPT = 0.05
 # a gradient as many times its standard error allows a step over the whole trust region; with less
 # the radius falls steeply, so that samples are added up before the next step
 _SURE, _STEEP = 2.0, 6
 # the radius stays between these, in units of the distance of a sample
 _LEAST, _MOST = 0.05, 16.0
-# the model is faithful where it promised as much as came, give or take this share
+# the model is faithful where the acceptance ratio is 1, give or take this much
 _FAITH = 0.5
 # how near to the boundary is at it
 _EDGE = 0.99
@@ -29,17 +29,17 @@ class Trust(eqx.Module):
     """How far the model is believed.
 
     `width` is that of the samples relative to sigma, `radius` that of the trust region in widths,
-    `promised` the decrease that the model expected of the last step. `lowest` is the lowest value
-    so far, `quiet` counts the steps in a row that led nowhere, and `blind` says that the last
+    `reduction` the one that the model predicted for the last step. `lowest` is the lowest value so
+    far, `stall` counts the steps in a row that led nowhere, and `insignificant` says that the last
     gradient was all noise.
     """
 
     width: Float[Array, ""]
     radius: Float[Array, ""]
-    promised: Float[Array, ""]
+    reduction: Float[Array, ""]
     lowest: Float[Array, ""]
-    quiet: Int[Array, ""]
-    blind: Bool[Array, ""]
+    stall: Int[Array, ""]
+    insignificant: Bool[Array, ""]
 
     @staticmethod
     def start(n: int, dtype) -> "Trust":
@@ -52,22 +52,23 @@ class Trust(eqx.Module):
 class Step(NamedTuple):
     """A step in units of the width, and what speaks for it.
 
-    `bold` is the length of the step if there were no noise, `spread` the noise of the Newton step
-    along it. At the `edge` the trust region cuts the step short. A `blind` step is zero, since the
-    gradient is all noise, and on a `flat` function there is no gradient at all.
+    `reduction` is the predicted one, `undamped` the length of the step if there were no noise, and
+    `spread` the noise of the Newton step along it. At the `edge` the trust region cuts the step
+    short. An `insignificant` step is zero, since the gradient is all noise, and on a `constant`
+    function there is no gradient at all.
     """
 
     p: Float[Array, " n"]
-    promised: Float[Array, ""]
-    bold: Float[Array, ""]
+    reduction: Float[Array, ""]
+    undamped: Float[Array, ""]
     spread: Float[Array, ""]
     edge: Bool[Array, ""]
-    blind: Bool[Array, ""]
-    flat: Bool[Array, ""]
+    insignificant: Bool[Array, ""]
+    constant: Bool[Array, ""]
 
 
 def outcome(
-    model: ScalarFit, before: Float[Array, " n"], promised: Float[Array, ""]
+    model: ScalarFit, before: Float[Array, " n"], reduction: Float[Array, ""]
 ) -> tuple[Bool[Array, ""], Float[Array, ""]]:
     """Whether the step from `before` to here was good, and the ratio that says so.
 
@@ -78,7 +79,7 @@ def outcome(
     fell = model.value(before) - model.value(jnp.zeros_like(before))
     noise = model.difference_stderr(before)
     # after no step at all there is nothing to regret
-    ratio = jnp.where(promised > 0, (fell + noise) / (promised + noise), 1)
+    ratio = jnp.where(reduction > 0, (fell + noise) / (reduction + noise), 1)
     return ratio > _ACCEPT, ratio
 
 
@@ -114,21 +115,21 @@ def propose(
     most = math.sqrt(grad.size)
     reach = jnp.minimum(radius * sure, most)
     p = confine(truncated_cg(curvature, believed, reach))
-    promised = -(jnp.vdot(believed, p) + jnp.vdot(p, curvature(p)) / 2)
+    reduction = -(jnp.vdot(believed, p) + jnp.vdot(p, curvature(p)) / 2)
     # bounds can leave of a step what is worse than none
-    p = jnp.where(promised > 0, p, 0)
-    bold = truncated_cg(curvature, hold(turn.out(grad)), jnp.minimum(radius, most))
-    bent = jnp.abs(jnp.vdot(bold, curvature(bold)))
-    ahead = turn.out(bold)
+    p = jnp.where(reduction > 0, p, 0)
+    undamped = truncated_cg(curvature, hold(turn.out(grad)), jnp.minimum(radius, most))
+    bent = jnp.abs(jnp.vdot(undamped, curvature(undamped)))
+    ahead = turn.out(undamped)
     error_ahead = model.slope_stderr(at, _ratio(ahead, jnp.linalg.norm(ahead)))
     return Step(
         p=p,
-        promised=jnp.maximum(promised, 0),
-        bold=jnp.linalg.norm(bold),
-        spread=_ratio(error_ahead * jnp.vdot(bold, bold), bent),
+        reduction=jnp.maximum(reduction, 0),
+        undamped=jnp.linalg.norm(undamped),
+        spread=_ratio(error_ahead * jnp.vdot(undamped, undamped), bent),
         edge=jnp.linalg.norm(p) >= _EDGE * reach,
-        blind=~jnp.any(believed != 0),
-        flat=size == 0,
+        insignificant=~jnp.any(believed != 0),
+        constant=size == 0,
     )
 
 
@@ -150,8 +151,8 @@ def revise(
 
     The width goes to the length of the Newton step, or to its noise if that is more: where samples
     are too few to tell, narrower ones would tell even less. Where all is noise it grows, and where
-    the function is flat it grows beyond sigma. A step has led somewhere if the `value` where it
-    started is the lowest so far, unless the next one is blind or `small`.
+    the function is constant it grows beyond sigma. A step has led somewhere if the `value` where it
+    started is the lowest so far, unless the next one is insignificant or `small`.
     """
     most = math.sqrt(step.p.size)
     length = jnp.linalg.norm(step.p)
@@ -160,19 +161,19 @@ def revise(
     change = jnp.where(faithful, 2.0, jnp.where(~good | (ratio < 0.25), 0.5, 1.0))
     width, factor = trust.width, jnp.ones_like(radius)
     if adaptive:
-        need = jnp.maximum(jnp.minimum(step.bold, radius) / most, step.spread)
+        need = jnp.maximum(jnp.minimum(step.undamped, radius) / most, step.spread)
         factor = jnp.where(step.edge & good, 1, jnp.clip(need, 0.25, 1))
         factor = jnp.where(length >= _EDGE * most, 1.5, factor)
-        factor = jnp.where(step.blind, jnp.clip(need, 0.5, 1.2), factor)
+        factor = jnp.where(step.insignificant, jnp.clip(need, 0.5, 1.2), factor)
         factor = jnp.minimum(factor, jnp.maximum(1 / width, 1))
-        factor = jnp.where(step.flat, 2, factor)
+        factor = jnp.where(step.constant, 2, factor)
     # the radius is in widths, and the region shall not shrink only because the width does
     radius = jnp.maximum(radius * change, _LEAST * most) / jnp.minimum(factor, 1)
     return Trust(
         width=width * factor,
         radius=jnp.minimum(radius, _MOST * most),
-        promised=step.promised,
+        reduction=step.reduction,
         lowest=jnp.minimum(trust.lowest, value),
-        quiet=jnp.where(step.blind | small | (value >= trust.lowest), trust.quiet + 1, 0),
-        blind=step.blind,
+        stall=jnp.where(step.insignificant | small | (value >= trust.lowest), trust.stall + 1, 0),
+        insignificant=step.insignificant,
     )

@@ -43,7 +43,7 @@ class Proposal(NamedTuple):
     """Steps to evaluate, in units of the metric, and what the model says of them."""
 
     steps: Float[Array, "K n"]
-    promised: Float[Array, " K"]
+    reduction: Float[Array, " K"]
     hessian: Float[Array, "n n"]
     poor: Bool[Array, ""]
 
@@ -100,10 +100,10 @@ class QuadraticTrust(eqx.Module):
 
         radii = self.radius * powers_of_two(count, fun.dtype)
         steps = jax.vmap(lambda radius: minimiser(hessian, grad, radius))(radii)
-        promised = -(dot(steps, grad) + jnp.sum(dot(steps, hessian) * steps, axis=1) / 2)
+        reduction = -(dot(steps, grad) + jnp.sum(dot(steps, hessian) * steps, axis=1) / 2)
         # where the model asks for nothing, a point that teaches it something: one of the two ends
         # of what the farthest evaluation determines alone
-        improve = self.improve | ~(promised[0] > jnp.finfo(fun.dtype).eps * jnp.abs(fun))
+        improve = self.improve | ~(reduction[0] > jnp.finfo(fun.dtype).eps * jnp.abs(fun))
 
         def other() -> Array:
             ends = jnp.stack([minimiser(s * bend, s * slope, self.radius) for s in (1, -1)])
@@ -112,8 +112,8 @@ class QuadraticTrust(eqx.Module):
 
         first = jax.lax.cond(improve, other, lambda: steps[0])
         steps = steps.at[0].set(first)
-        promised = promised.at[0].set(jnp.where(improve, 0, promised[0]))
-        return Proposal(steps, promised, hessian, poor)
+        reduction = reduction.at[0].set(jnp.where(improve, 0, reduction[0]))
+        return Proposal(steps, reduction, hessian, poor)
 
     def _fit(
         self, history: History, center: Array, fun: Array
@@ -188,7 +188,7 @@ class QuadraticTrust(eqx.Module):
         """The region after these values came; its metric is that of the last Hessian."""
         funs = jnp.where(good, funs, jnp.inf)
         best = jnp.argmin(funs)
-        fun, promised = funs[best], proposal.promised[best]
+        fun, reduction = funs[best], proposal.reduction[best]
         hessian = proposal.hessian
         metric, turn = self.metric.adapted(
             lambda v: dot(hessian, v), jnp.diagonal(hessian), jnp.zeros_like(fun)
@@ -199,8 +199,8 @@ class QuadraticTrust(eqx.Module):
             lambda a, b: jnp.where(usable, a, b), (metric, turn), (self.metric, still)
         )
         length = jnp.linalg.norm(turn.into(proposal.steps[best]))
-        tried = promised > 0
-        ratio = jnp.where(tried, (before - fun) / jnp.where(tried, promised, 1), 0)
+        tried = reduction > 0
+        ratio = jnp.where(tried, (before - fun) / jnp.where(tried, reduction, 1), 0)
         failed = tried & ~(ratio > _FAILED)
         fails = jnp.where(failed, self.fails + 1, jnp.where(tried, 0, self.fails))
         # a model of far points is made better before it is trusted less

@@ -39,8 +39,8 @@ class Center(eqx.Module):
     def moved(self, theta: Float[Array, " n"]) -> "Center":
         """The same samples, around another point."""
         trust = self.trust
-        still = jnp.zeros_like(trust.promised), jnp.zeros_like(trust.quiet)
-        trust = eqx.tree_at(lambda t: (t.promised, t.quiet), trust, still)
+        still = jnp.zeros_like(trust.reduction), jnp.zeros_like(trust.stall)
+        trust = eqx.tree_at(lambda t: (t.reduction, t.stall), trust, still)
         return Center(theta, theta, self.metric, trust)
 
     def sample(self, params: Params, z: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -65,24 +65,24 @@ class Center(eqx.Module):
         theta, metric, trust = self.theta, self.metric, self.trust
         model = fit(metric.into(points - theta[None]) / trust.width, values, valid)
         before = metric.into(self.accepted - theta) / trust.width
-        good, ratio = outcome(model, before, trust.promised)
+        good, ratio = outcome(model, before, trust.reduction)
         at, base = jnp.where(good, 0, before), jnp.where(good, theta, self.accepted)
         turned, turn = _adapted(metric, model, at) if adaptive else (metric, metric.unit())
 
-        held = _held(params, base, metric.slope(model.grad(at)), trust.width * metric.widest())
-        hold = (lambda p: p) if held is None else turned.holding(held)
+        active = _held(params, base, metric.slope(model.grad(at)), trust.width * metric.widest())
+        hold = (lambda p: p) if active is None else turned.holding(active)
 
         def confine(p: Array) -> Array:
-            if held is None:
+            if active is None:
                 return p
             x = _bounded(params, turned, base, p, trust.width, mirror=False)
             return turned.into(x - base) / trust.width
 
         step = propose(model, at, turn, trust.radius, hold, confine)
         x = params.clip(base + trust.width * turned.out(step.p))
-        if held is not None:
+        if active is not None:
             # to the last bit, or it would not be at its bound in the next step
-            x = jnp.where(held, base, x)
+            x = jnp.where(active, base, x)
 
         here = jnp.zeros_like(at)
         known = jnp.where(valid, values, jnp.inf)
@@ -90,10 +90,10 @@ class Center(eqx.Module):
         # an estimate below all samples is an error of the model
         value = jnp.maximum(model.value(here), known[lowest])
         new = revise(trust, step, good, ratio, value, small(x - base), adaptive)
-        back = (new.quiet >= _LOST) & (new.quiet % 2 == 0) & returns
+        back = (new.stall >= _LOST) & (new.stall % 2 == 0) & returns
         x, base = (jnp.where(back, points[lowest], a) for a in (x, base))
-        narrower = _NARROWER * trust.width, jnp.zeros_like(new.promised)
-        there = eqx.tree_at(lambda t: (t.width, t.promised), new, narrower)
+        narrower = _NARROWER * trust.width, jnp.zeros_like(new.reduction)
+        there = eqx.tree_at(lambda t: (t.width, t.reduction), new, narrower)
         new = jax.tree.map(lambda a, b: jnp.where(back, a, b), there, new)
         return Center(x, base, turned, new), value, model.value_stderr(here)
 

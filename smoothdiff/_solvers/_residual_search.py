@@ -83,7 +83,7 @@ class ResidualSearch(AbstractPointSearch):
         nothing = Proposal(
             steps=jnp.zeros((count, n), dtype),
             predicted=jnp.zeros((count, size), dtype),
-            promised=jnp.zeros(count, dtype),
+            reduction=jnp.zeros(count, dtype),
             slope=jnp.zeros(count, dtype),
             jacobian=self.trust.jacobian,
             poor=jnp.asarray(False),

@@ -49,7 +49,7 @@ class Proposal(NamedTuple):
 
     steps: Float[Array, "K n"]
     predicted: Float[Array, "K P"]
-    promised: Float[Array, " K"]
+    reduction: Float[Array, " K"]
     slope: Float[Array, " K"]
     jacobian: Float[Array, "n P"]
     poor: Bool[Array, ""]
@@ -106,14 +106,14 @@ class TrustRegion(eqx.Module):
         radii = self.radius * powers_of_two(count, row.dtype)
         steps = jax.vmap(lambda radius: bounded_step(hessian, grad, radius, *sides))(radii)
         change, slope = dot(steps, jacobian), -dot(steps, grad)
-        promised = slope - jnp.sum(change**2, axis=1) / 2
+        reduction = slope - jnp.sum(change**2, axis=1) / 2
         # where the model asks for nothing, a point that teaches it something
         eps = jnp.finfo(row.dtype).eps
-        improve = self.improve | ~(promised[0] > eps * jnp.sum(row**2))
+        improve = self.improve | ~(reduction[0] > eps * jnp.sum(row**2))
         other = _roomy(self.radius * lacking, *sides)
         steps = steps.at[0].set(jnp.where(improve, other, steps[0]))
-        promised = promised.at[0].set(jnp.where(improve, 0, promised[0]))
-        return Proposal(steps, row[None] + change, promised, slope, jacobian, poor)
+        reduction = reduction.at[0].set(jnp.where(improve, 0, reduction[0]))
+        return Proposal(steps, row[None] + change, reduction, slope, jacobian, poor)
 
     def _fit(
         self, history: History, center: Array, row: Array, sigma: Array
@@ -156,16 +156,16 @@ class TrustRegion(eqx.Module):
         before = jnp.sum(row**2) / 2
         funs = jnp.where(good, jnp.sum(rows**2, axis=1) / 2, jnp.inf)
         best = jnp.argmin(funs)
-        fun, promised = funs[best], proposal.promised[best]
+        fun, reduction = funs[best], proposal.reduction[best]
         length: Array = jnp.linalg.norm(proposal.steps[best])
         tiny = jnp.finfo(row.dtype).tiny
-        ratio = jnp.where(promised > 0, (before - fun) / jnp.maximum(promised, tiny), 0)
+        ratio = jnp.where(reduction > 0, (before - fun) / jnp.maximum(reduction, tiny), 0)
         off = jnp.linalg.norm(rows[best] - proposal.predicted[best])
         expected = jnp.linalg.norm(proposal.predicted[best] - row)
         error = off / jnp.maximum(expected, tiny)
         error = jnp.asarray(jnp.where(jnp.isfinite(fun), error, jnp.inf))
         same = jnp.all(rows[best] == row)
-        tried = promised > 0
+        tried = reduction > 0
         failed = tried & ~(ratio > _FAILED)
         fails = jnp.where(failed, self.fails + 1, jnp.where(tried, 0, self.fails))
         shorter = (self.fails > 0) & (length < _SHORTER * self.length)

@@ -46,7 +46,7 @@ class ScalarFit(eqx.Module):
     def _products(self, at: Array) -> Array:
         return dot(self.points, at) / at.size
 
-    def _bumps(self, at: Array) -> Array:
+    def _radial_terms(self, at: Array) -> Array:
         n = at.size
         away = self.points - at[None]
         height = (n / (n + 1)) ** (n / 2)
@@ -55,7 +55,7 @@ class ScalarFit(eqx.Module):
     def _value_features(self, at: Array) -> Array:
         product = self._products(at)
         size = jnp.sum(self.points * self.points, axis=1) / at.size**2
-        return product + self.curved * (product**2 + size) + self._bumps(at)
+        return product + self.curved * (product**2 + size) + self._radial_terms(at)
 
     def value(self, at: Float[Array, " n"]) -> Float[Array, ""]:
         """The smoothed function."""
@@ -64,41 +64,41 @@ class ScalarFit(eqx.Module):
     def grad(self, at: Float[Array, " n"]) -> Float[Array, " n"]:
         """Its gradient."""
         n = at.size
-        bumps = self.coefficients * self._bumps(at) / (n + 1)
+        radials = self.coefficients * self._radial_terms(at) / (n + 1)
         slopes = self.coefficients * (1 + 2 * self.curved * self._products(at)) / n
-        return dot(slopes + bumps, self.points) - jnp.sum(bumps) * at
+        return dot(slopes + radials, self.points) - jnp.sum(radials) * at
 
     def _bends(self, at: Array) -> tuple[Array, Array, Array]:
         n = at.size
-        bumps = self.coefficients * self._bumps(at) / (n + 1)
-        return 2 * self.curved * self.coefficients / n**2, bumps, self.points - at[None]
+        radials = self.coefficients * self._radial_terms(at) / (n + 1)
+        return 2 * self.curved * self.coefficients / n**2, radials, self.points - at[None]
 
     def curvature(self, at: Float[Array, " n"]) -> Callable[[Array], Array]:
         """Its Hessian as a product with vectors."""
-        bends, bumps, away = self._bends(at)
+        bends, radials, away = self._bends(at)
 
         def product(v: Array) -> Array:
             curved = dot(bends * dot(self.points, v), self.points)
-            rest = dot(bumps / (v.size + 1) * dot(away, v), away)
-            return curved + rest - jnp.sum(bumps) * v
+            rest = dot(radials / (v.size + 1) * dot(away, v), away)
+            return curved + rest - jnp.sum(radials) * v
 
         return product
 
     def curvature_diagonal(self, at: Float[Array, " n"]) -> Float[Array, " n"]:
         """The diagonal of its Hessian."""
-        bends, bumps, away = self._bends(at)
+        bends, radials, away = self._bends(at)
         curved = dot(bends, self.points**2)
-        return curved + dot(bumps / (at.size + 1), away**2) - jnp.sum(bumps)[None]
+        return curved + dot(radials / (at.size + 1), away**2) - jnp.sum(radials)[None]
 
     # Standard errors: what the prior leaves open of a quantity, less what the samples tell of it.
 
-    def _told(self, features: Array) -> Array:
+    def _explained(self, features: Array) -> Array:
         near = self.closeness if features.ndim == 1 else self.closeness[:, None]
         return jax.scipy.linalg.solve_triangular(self.factor, near * features, lower=True)
 
     def _stderr(self, features: Array, prior: Array) -> Array:
-        told = jnp.sum(self._told(features) ** 2, axis=0)
-        return self.amplitude * jnp.sqrt(jnp.maximum(prior - told, 0))
+        explained = jnp.sum(self._explained(features) ** 2, axis=0)
+        return self.amplitude * jnp.sqrt(jnp.maximum(prior - explained, 0))
 
     def _covariance(self, a: Array, b: Array) -> Array:
         """Of the smoothed function at two places, before any sample."""
@@ -111,10 +111,10 @@ class ScalarFit(eqx.Module):
 
     def value_stderr(self, at: Float[Array, " n"]) -> Float[Array, ""]:
         """The standard error of the smoothed function."""
-        told = self._told(self._value_features(at))
-        ones = self._told(jnp.ones_like(self.closeness))
-        left = self._covariance(at, at) - jnp.sum(told**2)
-        constant = (1 - jnp.vdot(told, ones)) ** 2 / jnp.sum(ones**2)
+        explained = self._explained(self._value_features(at))
+        ones = self._explained(jnp.ones_like(self.closeness))
+        left = self._covariance(at, at) - jnp.sum(explained**2)
+        constant = (1 - jnp.vdot(explained, ones)) ** 2 / jnp.sum(ones**2)
         return self.amplitude * jnp.sqrt(jnp.maximum(left + constant, 0))
 
     def difference_stderr(self, at: Float[Array, " n"]) -> Float[Array, ""]:
@@ -126,20 +126,20 @@ class ScalarFit(eqx.Module):
 
     def _grad_features(self, at: Array) -> tuple[Array, Array]:
         """Weights of the points and of the place in the gradient's features."""
-        bumps = self._bumps(at) / (at.size + 1)
-        return (1 + 2 * self.curved * self._products(at)) / at.size + bumps, bumps
+        radials = self._radial_terms(at) / (at.size + 1)
+        return (1 + 2 * self.curved * self._products(at)) / at.size + radials, radials
 
     def grad_stderr(self, at: Float[Array, " n"]) -> Float[Array, " n"]:
         """The standard errors of the gradient's entries."""
-        slopes, bumps = self._grad_features(at)
-        features = slopes[:, None] * self.points - bumps[:, None] * at[None]
+        slopes, radials = self._grad_features(at)
+        features = slopes[:, None] * self.points - radials[:, None] * at[None]
         return self._stderr(features, self._grad_prior(at, at**2))
 
     def slope_stderr(self, at: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, ""]:
         """The standard error of the gradient along a unit vector."""
-        slopes, bumps = self._grad_features(at)
+        slopes, radials = self._grad_features(at)
         along = jnp.vdot(at, v)
-        features = slopes * dot(self.points, v) - bumps * along
+        features = slopes * dot(self.points, v) - radials * along
         return self._stderr(features, self._grad_prior(at, along**2))
 
     def _grad_prior(self, at: Array, along: Array) -> Array:
@@ -152,8 +152,8 @@ class ScalarFit(eqx.Module):
         n = at.size
         along = dot(self.points, v)
         away = along - jnp.vdot(at, v)
-        bumps = self._bumps(at) / (n + 1)
-        features = 2 * self.curved * along**2 / n**2 + bumps * (away**2 / (n + 1) - 1)
+        radials = self._radial_terms(at) / (n + 1)
+        features = 2 * self.curved * along**2 / n**2 + radials * (away**2 / (n + 1) - 1)
         rest = 3 * self.radial * (n / (n + 2)) ** (n / 2) / (n + 2) ** 2
         return self._stderr(features, 4 * self.curved / n**2 + rest)
 

@@ -135,7 +135,7 @@ class ValueSearch(AbstractPointSearch):
         slot = jnp.arange(count, dtype=jnp.int32)
         nothing = Proposal(
             steps=jnp.zeros((count, n), self.start.dtype),
-            promised=jnp.zeros(count, self.start.dtype),
+            reduction=jnp.zeros(count, self.start.dtype),
             hessian=self.trust.hessian,
             poor=jnp.asarray(False),
         )
@@ -261,4 +261,4 @@ class ValueSearch(AbstractPointSearch):
 def _lost(center: Center, sizes: Sizes) -> Bool[Array, ""]:
     """Whether rounds of wide samples led nowhere for too long, or have no width any more."""
     trust = center.trust
-    return (trust.quiet * sizes.first >= sizes.patience) | nothing(trust.width)
+    return (trust.stall * sizes.first >= sizes.patience) | nothing(trust.width)

@@ -41,7 +41,7 @@ class FirstOrderState(eqx.Module):
     progress: Progress
     opt_state: PyTree
     average: PyTree[Array]
-    quiet: Int[Array, ""]
+    stall: Int[Array, ""]
 
 
 class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
@@ -189,7 +189,7 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
         )
         with promotion():
             moved, size = self.norm(jax.tree.map(jnp.subtract, new_y, y)), self.norm(y)
-            quiet = jnp.where(moved < self.atol + self.rtol * size, state.quiet + 1, 0)
+            stall = jnp.where(moved < self.atol + self.rtol * size, state.stall + 1, 0)
         finite = all_finite((fun, grad, new_y))
         new_y, opt_state, average = unless_failed(
             finite, (new_y, opt_state, average), (y, state.opt_state, state.average)
@@ -197,11 +197,11 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
         sigma = sigma_at(self.sigma, progress.step)
         progress = progress.after(y, fun, stderr, sigma, self.num_samples, finite, seen)
         # the function was never evaluated at y itself, so its aux is that of a sample near y
-        return new_y, FirstOrderState(progress, opt_state, average, quiet), seen.aux
+        return new_y, FirstOrderState(progress, opt_state, average, stall), seen.aux
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """After small updates in a row, or a failed step."""
-        return stopped(state.progress, state.quiet >= _PATIENCE)
+        return stopped(state.progress, state.stall >= _PATIENCE)
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         """Judges all that was seen, the start, the last iterate, the average, the best estimate."""

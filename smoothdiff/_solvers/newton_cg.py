@@ -201,7 +201,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         """Small steps, or a gradient that is all noise however many samples there are."""
         batches = isinstance(state, _newton_batches.NewtonBatchState)
         center = state.center if batches else state.search.center
-        return "noise" if center.trust.blind else "converged"
+        return "noise" if center.trust.insignificant else "converged"
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         """Judges the best point, with noise beside others."""

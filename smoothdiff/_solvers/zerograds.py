@@ -45,7 +45,7 @@ class ZeroGradsState(eqx.Module):
     progress: Progress
     fit: Fit
     opt_state: PyTree
-    quiet: Int[Array, ""]
+    stall: Int[Array, ""]
 
 
 class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
@@ -302,7 +302,7 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
         )
         with promotion():
             moved, length = self.norm(jax.tree.map(jnp.subtract, new_y, y)), self.norm(y)
-            quiet = jnp.where(moved < self.atol + self.rtol * length, state.quiet + 1, 0)
+            stall = jnp.where(moved < self.atol + self.rtol * length, state.stall + 1, 0)
         finite = all_finite((fit.weights, fit.spread, new_y))
         new_y, fit, opt_state = unless_failed(
             finite, (new_y, fit, opt_state), (y, state.fit, state.opt_state)
@@ -311,11 +311,11 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
         sigma = sigma_at(self.sigma, progress.step)
         progress = progress.after(y, fun, stderr, sigma, self.num_samples, finite, seen)
         # the function was never evaluated at y itself, so its aux is that of a sample near y
-        return new_y, ZeroGradsState(progress, fit, opt_state, quiet), seen.aux
+        return new_y, ZeroGradsState(progress, fit, opt_state, stall), seen.aux
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """After small updates in a row, or a failed step."""
-        return stopped(state.progress, state.quiet >= _PATIENCE)
+        return stopped(state.progress, state.stall >= _PATIENCE)
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         """Judges all that was seen, the start, the last iterate and the best estimate.
