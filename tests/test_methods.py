@@ -39,7 +39,7 @@ SLOW = {
     "fr22": (600, 1e-2, 2),
     "first_order": (600, 1e-2, 8),
     "zerograds": (600, 1e-2, 2),
-    "newton_cg": (200, 1e-6, 6),
+    "newton_cg": (200, 1e-6, 1),
     "gauss_newton": (60, 1e-6, 1),
     "optax_perturbations": (600, 1e-2, 4),
     # the slope that sets the unit, then the value and the gradient of the first step

@@ -57,7 +57,7 @@ def judged(
 
     def more(state: tuple[Array, Array]) -> Bool[Array, ""]:
         done, found = state
-        return (done == 0) | ((done < rounds) & _differ(found[each - 1], progress.lowest_fun))
+        return (done == 0) | ((done < rounds) & differ(found[each - 1], progress.lowest_fun))
 
     # one loop, so that the function is compiled once, and every value of a point by one program
     def evaluated(state: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -109,7 +109,7 @@ def _rounds(count: int, each: int) -> int:
     return -(-_REPEATS * count // each)
 
 
-def _differ(again: Float[Array, ""], before: Float[Array, ""]) -> Bool[Array, ""]:
+def differ(again: Float[Array, ""], before: Float[Array, ""]) -> Bool[Array, ""]:
     """Whether a value that was computed twice differs by more than rounding."""
     eps = _ROUNDING * jnp.finfo(before.dtype).eps
     return jnp.isfinite(before) & ~(jnp.abs(again - before) <= eps * jnp.abs(before))

@@ -27,6 +27,8 @@ from smoothdiff._solvers._point_search import AbstractPointSearch, Sizes
 # by default a search ends after so many evaluations for each parameter, and one, without a lower
 # point
 PATIENCE = 20
+# of at least so many evaluations half must be finite where others may be dropped
+_ENOUGH = 10
 # the widths of later searches without bounds, relative to sigma, as powers of two at random
 _WIDTHS = 2.0
 
@@ -82,10 +84,10 @@ def step(
     # the end of a step that is tried may be anything, and so may a place that nobody asked for
     later = state.restarts < solver.restarts
     if solver.nonfinite == "propagate":
-        finite = jnp.all(good) | search.is_local() | later
+        finite = jnp.all(good) | later
     else:
-        finite = after.enough(sizes.first)
-    finite &= jnp.all(jnp.isfinite(theta))
+        finite = after.enough(max(sizes.first, _ENOUGH))
+    finite = (finite | search.is_local()) & jnp.all(jnp.isfinite(theta))
     new_y, after = unless_failed(finite, (new_y, after), (y, search))
     best = after.history.best(theta)[2]
     unknown = jnp.asarray(jnp.nan, theta.dtype)

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from smoothdiff._params import Params
 from smoothdiff._solvers._base import all_finite
 from smoothdiff._solvers._history import History
+from smoothdiff._solvers._judgement import differ
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._point_search import (
     FIRST,
@@ -56,11 +57,14 @@ class ValueSearch(AbstractPointSearch):
     """Where a search stands, with the local model and the center of the wide samples.
 
     A `patient` search is the wide model's alone, and never goes back to the lowest sample: what is
-    lowest by chance does not lead it away from where the smoothed function is low.
+    lowest by chance does not lead it away from where the smoothed function is low. Nor does any
+    search where the function is `noisy`: where it gave another value for the same point, which the
+    first round of samples begins with.
     """
 
     first_width: Float[Array, ""]
     patient: Bool[Array, ""]
+    noisy: Bool[Array, ""]
     trust: QuadraticTrust
     center: Center
     taken: Int[Array, ""]
@@ -86,6 +90,7 @@ class ValueSearch(AbstractPointSearch):
             stale=none,
             first_width=width,
             patient=jnp.asarray(False),
+            noisy=jnp.asarray(False),
             trust=QuadraticTrust.start(sigma, width),
             center=center,
             taken=none,
@@ -103,8 +108,8 @@ class ValueSearch(AbstractPointSearch):
         theta, width = jnp.where(here, start, theta), jnp.where(here, 1, 10**power)
         anew = ValueSearch.of(theta, params.sigma, width, empty)
         stage = jnp.where(here, WIDE, FIRST).astype(self.stage.dtype)
-        changed = stage, self.rounds + 1, here
-        return eqx.tree_at(lambda s: (s.stage, s.rounds, s.patient), anew, changed)
+        changed = stage, self.rounds + 1, here, self.noisy
+        return eqx.tree_at(lambda s: (s.stage, s.rounds, s.patient, s.noisy), anew, changed)
 
     def over(self, sizes: Sizes) -> Bool[Array, ""]:
         """Whether neither model leads anywhere."""
@@ -156,7 +161,9 @@ class ValueSearch(AbstractPointSearch):
 
         def wide() -> tuple[Array, Proposal]:
             z = draw(sizes.first)[jnp.minimum(self.taken + slot, sizes.first - 1)]
-            return jax.vmap(lambda z: self.center.sample(params, z))(z), nothing
+            points = jax.vmap(lambda z: self.center.sample(params, z))(z)
+            best, *_ = self.history.best(self.start)
+            return points.at[0].set(jnp.where(self._checks(), best, points[0])), nothing
 
         return jax.lax.switch(self.stage, [first, local, wide])
 
@@ -189,17 +196,22 @@ class ValueSearch(AbstractPointSearch):
 
         def wide() -> "ValueSearch":
             taken = self.taken + sizes.step
-            more = eqx.tree_at(lambda s: s.taken, known, taken)
-            full = lambda: known._stepped(params)._turned(sizes)
+            noisy = self.noisy | (self._checks() & good[0] & differ(funs[0], before))
+            more = eqx.tree_at(lambda s: (s.taken, s.noisy), known, (taken, noisy))
+            full = lambda: more._stepped(params)._turned(sizes)
             return jax.lax.cond(taken >= sizes.first, full, lambda: more)
 
         return jax.lax.switch(self.stage, [first, local, wide])
+
+    def _checks(self) -> Bool[Array, ""]:
+        """Whether a point is evaluated again that was evaluated before."""
+        return (self.rounds == 0) & (self.taken == 0)
 
     def _stepped(self, params: Params) -> "ValueSearch":
         """The next center, from all samples."""
         history = self.history
         center, *_ = self.center.stepped(
-            params, history.points, history.funs, history.valid, True, ~self.patient
+            params, history.points, history.funs, history.valid, True, ~self.patient & ~self.noisy
         )
         # a metric can overflow where the function is flat
         finite = all_finite((center.theta, center.metric, center.trust.width))
