@@ -31,6 +31,8 @@ from smoothdiff._stderr import value_stderr
 
 # the most entries of the points that are kept by default, 128 MB in float64
 _MEMORY = 2**24
+# ... and otherwise from so many to so many of them
+FEWEST, MOST = 40, 512
 # by default a search ends after so many steps in a row that led nowhere
 _PATIENCE = 30
 
@@ -98,7 +100,7 @@ def init(solver: Any, y: PyTree[Array], options: dict, dtype: Any) -> NewtonBatc
     """Checks what can be looked at; evaluates nothing."""
     params = smoothed_params(solver, y, jnp.asarray(0, jnp.int32), options)
     theta, n = params.theta, params.theta.size
-    usual = min((n + 1) * (n + 2), 512, max(_MEMORY // n, 64)) if n > 5 else 42
+    usual = min(max((n + 1) * (n + 2), FEWEST), MOST, max(_MEMORY // n, 64))
     length = max(solver.history or usual, evaluations_per_step(solver, y))
     center = _first(solver, params, theta)
     kernel = center.metric, center.trust.width

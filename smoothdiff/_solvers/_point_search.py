@@ -89,9 +89,9 @@ class AbstractPointSearch(eqx.Module):
         """What may be better than the lowest point, but was not evaluated."""
         return []
 
+    @abc.abstractmethod
     def round(self) -> Int[Array, ""]:
         """Counts the rounds of samples, so that each has random numbers of its own."""
-        return self.evaluated
 
     def counted(self, small: Array, lower: Array, count: int) -> Any:
         """With a small step more or less, and so many evaluations."""

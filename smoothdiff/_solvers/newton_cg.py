@@ -20,9 +20,8 @@ from smoothdiff._solvers._value_search import ValueSearch
 
 # from so many parameters on, evaluations come in batches
 _MANY = 100
-# the fewest and the most samples of a round by default, and evaluations that are kept
+# the fewest and the most samples of a round by default
 _FEW, _SOME = 4, 16
-_FEWEST, _MOST = 40, 512
 
 
 class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
@@ -175,7 +174,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         params = smoothed_params(self, y, jnp.asarray(0, jnp.int32), options)
         theta, sizes = params.theta, self._sizes(y)
         n = theta.size
-        usual = min(max((n + 1) * (n + 2), _FEWEST), _MOST)
+        usual = min(max((n + 1) * (n + 2), _newton_batches.FEWEST), _newton_batches.MOST)
         length = max(self.history or usual, sizes.first, n + 2)
         history = History.empty(length, n, 1, theta.dtype)
         width = jnp.ones((), theta.dtype)
