@@ -21,6 +21,7 @@ from smoothdiff._solvers._base import (
     unless_failed,
 )
 from smoothdiff._solvers._evaluator import Evaluator
+from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import judged, judging
 from smoothdiff._solvers._point_search import AbstractPointSearch, Sizes
 
@@ -72,7 +73,7 @@ def step(
     funs = evaluate.funs(rows)
     good = jnp.isfinite(funs)
     rows, known = jnp.where(good[:, None], rows, 0), jnp.where(good, funs, 0)
-    after = search.after(params, points, rows, known, good, proposal, sizes)
+    after = search.after(params, History(points, rows, known, good), proposal, sizes)
 
     theta, width = after.iterate(), after.width()
     new_y = params.layout.tree(theta)

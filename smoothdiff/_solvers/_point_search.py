@@ -68,14 +68,11 @@ class AbstractPointSearch(eqx.Module):
     def after(
         self,
         params: Params,
-        points: Float[Array, "K n"],
-        rows: Float[Array, "K P"],
-        funs: Float[Array, " K"],
-        good: Bool[Array, " K"],
+        new: History,
         proposal: Any,
         sizes: Sizes,
     ) -> "AbstractPointSearch":
-        """The search with these rows and values at these points."""
+        """The search with these new evaluations."""
 
     @abc.abstractmethod
     def over(self, sizes: Sizes) -> Bool[Array, ""]:
@@ -100,10 +97,11 @@ class AbstractPointSearch(eqx.Module):
         counts = self.evaluated + count, small, stale
         return eqx.tree_at(lambda s: (s.evaluated, s.small, s.stale), self, counts)
 
-    def kept(self, points: Array, rows: Array, funs: Array, good: Array, count: int) -> Any:
+    def kept(self, new: History) -> Any:
         """With these evaluations in the history instead of the oldest."""
+        count = len(new.funs)
         room = self.history.keeping_best(count)
-        history = room.after(points, rows, funs, good, jnp.asarray(count))
+        history = room.after(new.points, new.rows, new.funs, new.valid, jnp.asarray(count))
         return eqx.tree_at(lambda s: s.history, self, history)
 
     def enough(self, count: int) -> Bool[Array, ""]:

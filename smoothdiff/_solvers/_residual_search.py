@@ -122,20 +122,17 @@ class ResidualSearch(AbstractPointSearch):
     def after(
         self,
         params: Params,
-        points: Float[Array, "K n"],
-        rows: Float[Array, "K P"],
-        funs: Float[Array, " K"],
-        good: Bool[Array, " K"],
+        new: History,
         proposal: Proposal,
         sizes: Sizes,
     ) -> "ResidualSearch":
         """The search with these residuals at these points."""
         here = self.history.best(self.start)
-        with_rows = self.kept(points, rows, funs, good, sizes.step)
+        with_rows = self.kept(new)
         by_stage = [
             lambda: with_rows._after_first(sizes),
-            lambda: with_rows._after_local(here[1], rows, good, proposal),
-            lambda: with_rows._after_wide(params, rows, good, sizes),
+            lambda: with_rows._after_local(here[1], new.rows, new.valid, proposal),
+            lambda: with_rows._after_wide(params, new.rows, new.valid, sizes),
         ]
         return jax.lax.switch(self.stage, by_stage)
 

@@ -170,16 +170,13 @@ class ValueSearch(AbstractPointSearch):
     def after(
         self,
         params: Params,
-        points: Float[Array, "K n"],
-        rows: Float[Array, "K P"],
-        funs: Float[Array, " K"],
-        good: Bool[Array, " K"],
+        new: History,
         proposal: Proposal,
         sizes: Sizes,
     ) -> "ValueSearch":
-        """The search with these values at these points."""
+        """The search with these new evaluations."""
         before = self.history.best(self.start)[2]
-        known = self.kept(points, rows, funs, good, sizes.step)
+        known = self.kept(new)
         known = eqx.tree_at(lambda s: s.turn.spent, known, self.turn.spent + sizes.step)
 
         def first() -> "ValueSearch":
@@ -191,12 +188,12 @@ class ValueSearch(AbstractPointSearch):
             )
 
         def local() -> "ValueSearch":
-            trust = self.trust.revise(proposal, before, funs, good)
+            trust = self.trust.revise(proposal, before, new.funs, new.valid)
             return eqx.tree_at(lambda s: s.trust, known, trust)._turned(sizes)
 
         def wide() -> "ValueSearch":
             taken = self.taken + sizes.step
-            noisy = self.noisy | (self._checks() & good[0] & differ(funs[0], before))
+            noisy = self.noisy | (self._checks() & new.valid[0] & differ(new.funs[0], before))
             more = eqx.tree_at(lambda s: (s.taken, s.noisy), known, (taken, noisy))
             full = lambda: more._stepped(params)._turned(sizes)
             return jax.lax.cond(taken >= sizes.first, full, lambda: more)
