@@ -93,13 +93,16 @@ def test_the_radius_follows_the_ratio_and_the_metric_the_hessian(x64):
     assert after < before
 
 
-def test_it_has_failed_after_five_failures_in_a_row_or_without_a_radius(x64):
+def test_it_is_stuck_after_five_failures_in_a_row_and_failed_without_a_radius(x64):
     trust, proposal, _, fun = proposal_of(known(around(10)))
     for _ in range(5):
-        assert not trust.failed()
+        assert not trust.stuck()
         trust = trust.revise(proposal, jnp.asarray(fun), jnp.asarray([fun + 1]), jnp.ones(1, bool))
-    assert trust.failed()
-    assert not trust.revived(jnp.asarray(1.0)).failed()
+    assert trust.stuck()
+    assert not trust.failed()
+    assert not trust.retried().stuck()
+    assert trust.retried().radius == trust.radius
+    assert not trust.revived(jnp.asarray(1.0)).stuck()
     assert QuadraticTrust.start(jnp.ones(N), jnp.asarray(1e-16)).failed()
 
 

@@ -34,9 +34,9 @@ _RIDGE = {"float32": 1e-7, "float64": 1e-12}
 _FAILED, _HELD = 0.1, 0.7
 # an evaluation so many radii away should make way for a nearer one
 _FAR = 2.0
-# so many steps that fail in a row, or evaluations for each parameter without a lower point, are too
-# many
-_FAILS, _SLOW = 5, 4
+# so many steps that fail in a row are too many for now, and so many evaluations for each parameter,
+# and one, without a lower point for good
+_FAILS, _SLOW = 5, 10
 
 
 class Proposal(NamedTuple):
@@ -74,7 +74,15 @@ class QuadraticTrust(eqx.Module):
     def failed(self) -> Bool[Array, ""]:
         """Whether the model is of no use here, or nothing is left to do for it."""
         slow = self.slow >= _SLOW * (len(self.hessian) + 1)
-        return (self.fails >= _FAILS) | slow | nothing(self.radius)
+        return slow | nothing(self.radius)
+
+    def stuck(self) -> Bool[Array, ""]:
+        """Whether the model has not predicted for a while; a smaller radius may yet help."""
+        return (self.fails >= _FAILS) | self.failed()
+
+    def retried(self) -> "QuadraticTrust":
+        """With the radius as it is, and the failed steps forgotten."""
+        return eqx.tree_at(lambda t: t.fails, self, jnp.zeros_like(self.fails))
 
     def revived(self, radius: Float[Array, ""]) -> "QuadraticTrust":
         """Trusted again, at least as far as this, around another point."""

@@ -33,7 +33,9 @@ from smoothdiff._solvers._regression_step import Center
 _TURN, _TEST = 6, 4
 # the other takes over if it lowers the function at this share of the rate: the later, the less
 # there is to gain
-_SHARE = 0.1
+_SHARE = 0.3
+# of so many later searches one begins at the start
+_PATIENT = 4
 # the widths of later searches, in sigma, as powers of ten at random
 _NARROWEST, _WIDEST = -1.5, 0.3
 
@@ -56,14 +58,15 @@ class Turn(eqx.Module):
 class ValueSearch(AbstractPointSearch):
     """Where a search stands, with the local model and the center of the wide samples.
 
-    A `patient` search is the wide model's alone, and never goes back to the lowest sample: what is
+    Those after the first, which `searches` counts, are the wide model's alone, in turns a patient
+    one at the start and some elsewhere. A patient one never goes back to the lowest sample: what is
     lowest by chance does not lead it away from where the smoothed function is low. Nor does any
     search where the function is `noisy`: where it gave another value for the same point, which the
     first round of samples begins with.
     """
 
     first_width: Float[Array, ""]
-    patient: Bool[Array, ""]
+    searches: Int[Array, ""]
     noisy: Bool[Array, ""]
     trust: QuadraticTrust
     center: Center
@@ -89,7 +92,7 @@ class ValueSearch(AbstractPointSearch):
             small=none,
             stale=none,
             first_width=width,
-            patient=jnp.asarray(False),
+            searches=none,
             noisy=jnp.asarray(False),
             trust=QuadraticTrust.start(sigma, width),
             center=center,
@@ -101,19 +104,20 @@ class ValueSearch(AbstractPointSearch):
     def again(
         self, params: Params, theta: Float[Array, " n"], start: Float[Array, " n"], key: Array
     ) -> "ValueSearch":
-        """Another search: in turns a patient one at the start, and one elsewhere, of any width."""
+        """Another search: in turns a patient one at the start, and some elsewhere of any width."""
         empty = jax.tree.map(jnp.zeros_like, self.history)
-        here = ~self.patient
+        searches = self.searches + 1
+        here = _patient(searches)
         power = jax.random.uniform(key, (), theta.dtype, _NARROWEST, _WIDEST)
         theta, width = jnp.where(here, start, theta), jnp.where(here, 1, 10**power)
         anew = ValueSearch.of(theta, params.sigma, width, empty)
-        stage = jnp.where(here, WIDE, FIRST).astype(self.stage.dtype)
-        changed = stage, self.rounds + 1, here, self.noisy
-        return eqx.tree_at(lambda s: (s.stage, s.rounds, s.patient, s.noisy), anew, changed)
+        stage = jnp.full_like(self.stage, WIDE)
+        changed = stage, self.rounds + 1, searches, self.noisy
+        return eqx.tree_at(lambda s: (s.stage, s.rounds, s.searches, s.noisy), anew, changed)
 
     def over(self, sizes: Sizes) -> Bool[Array, ""]:
         """Whether neither model leads anywhere."""
-        lost = _lost(self.center, sizes) & (self.trust.failed() | self.patient)
+        lost = _lost(self.center, sizes) & (self.trust.failed() | (self.searches > 0))
         return self.converged() | lost
 
     def width(self) -> Float[Array, ""]:
@@ -206,9 +210,9 @@ class ValueSearch(AbstractPointSearch):
 
     def _stepped(self, params: Params) -> "ValueSearch":
         """The next center, from all samples."""
-        history = self.history
+        history, returns = self.history, ~_patient(self.searches) & ~self.noisy
         center, *_ = self.center.stepped(
-            params, history.points, history.funs, history.valid, True, ~self.patient & ~self.noisy
+            params, history.points, history.funs, history.valid, True, returns
         )
         # a metric can overflow where the function is flat
         finite = all_finite((center.theta, center.metric, center.trust.width))
@@ -223,18 +227,20 @@ class ValueSearch(AbstractPointSearch):
         point, _, fun = self.history.best(self.start)
         rate = (turn.before - fun) / jnp.maximum(turn.spent, 1).astype(fun.dtype)
         lower = rate > 0
-        ended = turn.spent >= turn.length
-        ended |= jnp.where(local, self.trust.failed(), _lost(self.center, sizes))
-        ended &= ~self.patient
+        stuck = local & self.trust.stuck()
+        ended = (turn.spent >= turn.length) | stuck
+        ended |= ~local & _lost(self.center, sizes)
+        ended &= self.searches == 0
 
         # what one has found the other begins with, unless it found little
         little = turn.test & (rate <= _SHARE * turn.rate)
-        revive = ~local & lower & self.trust.failed()
+        revive = ~local & lower & self.trust.stuck()
         trust = jax.tree.map(
             lambda a, b: jnp.where(revive, a, b),
             self.trust.revived(self.center.trust.width),
             self.trust,
         )
+        trust = jax.tree.map(lambda a, b: jnp.where(local, a, b), trust, trust.retried())
         move = local & ((lower & ~little) | (self.rounds == 0))
         center = jax.tree.map(
             lambda a, b: jnp.where(move, a, b), self.center.moved(point), self.center
@@ -242,14 +248,15 @@ class ValueSearch(AbstractPointSearch):
         done = jnp.stack([trust.failed(), _lost(center, sizes)])
         here = jnp.where(local, 0, 1)
         other = 1 - here
-        wins = turn.test & (~little | done[other])
+        wins = turn.test & (~little | done[other]) & ~stuck
         stays = wins & ~done[here]
         first = jnp.full_like(turn.usual, _TURN * (len(self.start) + 1))
         usual = jnp.where(turn.test, jnp.where(wins, first, 2 * turn.usual), turn.usual)
         follows = jnp.where(stays, here, other)
         skipped = done[follows]
         follows = jnp.where(skipped, 1 - follows, follows)
-        test = ~turn.test & ~skipped
+        # a local model that does not predict has lost, without a test of the other
+        test = ~turn.test & ~skipped & ~stuck
         usual = jnp.where(skipped, first, usual)
         short = jnp.full_like(usual, _TEST * (len(self.start) + 1))
         after = Turn(
@@ -265,6 +272,11 @@ class ValueSearch(AbstractPointSearch):
             lambda s: (s.stage, s.trust, s.center, s.turn), self, (stage, trust, center, after)
         )
         return jax.tree.map(lambda a, b: jnp.where(ended, a, b), turned, self)
+
+
+def _patient(searches: Int[Array, ""]) -> Bool[Array, ""]:
+    """Whether the search with this number is a patient one."""
+    return searches % _PATIENT == 1
 
 
 def _lost(center: Center, sizes: Sizes) -> Bool[Array, ""]:

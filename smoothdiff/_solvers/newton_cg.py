@@ -74,8 +74,8 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         patience: a search ends after so many evaluations in a row in which the wide model led
             nowhere, if the local one does not either; by default 20 (n + 1). With batches it counts
             steps, by default 30.
-        restarts: how many searches may follow: for functions with several minima. In turns one
-            begins at the first point with wide samples alone, and one anywhere within the bounds,
+        restarts: how many searches may follow, with wide samples alone: for functions with several
+            minima. One of four begins at the first point, the others anywhere within the bounds,
             without bounds around the best point so far, as wide as chance has it. With batches all
             begin at the first point. The best point of all is returned.
 
