@@ -236,7 +236,7 @@ def test_bad_options_are_refused(options, error, match):
         ({"sigma": None}, "nothing is smoothed"),
         ({"sigma": [0.1]}, "structure"),
         ({"num_samples": 7}, "multiple of 2"),
-        ({"num_samples": 0}, "positive"),
+        ({"num_samples": 0}, "at least one"),
         ({"baseline": "median"}, "baseline"),
     ],
 )

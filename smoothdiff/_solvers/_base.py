@@ -112,6 +112,19 @@ def unless_failed(finite: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
     return jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, old)
 
 
+def check_settings(solver: Any) -> None:
+    """Raises ValueError unless those settings hold that several solvers have."""
+    count, nonfinite = solver.num_samples, solver.nonfinite
+    if count is not None and count < 1:
+        raise ValueError(f"num_samples={count}: a step needs at least one evaluation")
+    if nonfinite not in ("propagate", "drop"):
+        raise ValueError(f'nonfinite must be "propagate" or "drop", not {nonfinite!r}')
+    if getattr(solver, "patience", None) is not None and solver.patience < 1:
+        raise ValueError(f"patience must be 1 or more: {solver.patience}")
+    if getattr(solver, "restarts", 0) < 0:
+        raise ValueError(f"restarts must be 0 or more: {solver.restarts}")
+
+
 class AbstractSmoothSolver(eqx.Module):
     """What a solver adds to optimistix's interface, so that `sd.minimise` can run it.
 

@@ -35,11 +35,3 @@ class Restarts(eqx.Module):
         again = over & (self.left > 0)
         going = jax.tree.map(lambda a, b: jnp.where(again, a, b), first, going)
         return going, Restarts(self.left - again.astype(self.left.dtype), self.theta, self.kernel)
-
-
-def check_restarts(patience: int | None, restarts: int) -> None:
-    """The arguments that solvers with restarts have in common."""
-    if patience is not None and patience < 1:
-        raise ValueError(f"patience must be 1 or more: {patience}")
-    if restarts < 0:
-        raise ValueError(f"restarts must be 0 or more: {restarts}")

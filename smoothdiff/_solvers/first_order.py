@@ -1,6 +1,7 @@
 """First order: any optax transformation, driven by the gradient of the smoothed function."""
 
 from collections.abc import Callable
+from dataclasses import KW_ONLY
 from typing import Literal
 
 import equinox as eqx
@@ -20,6 +21,7 @@ from smoothdiff._solvers._base import (
     AbstractSmoothSolver,
     Progress,
     all_finite,
+    check_settings,
     project,
     promotion,
     read_options,
@@ -92,43 +94,22 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
 
     optim: optax.GradientTransformation
     sigma: PyTree
-    num_samples: int
-    sampler: AbstractSampler
-    baseline: str | AbstractBaseline
-    batch_size: int | None
-    nonfinite: Literal["propagate", "drop"]
-    rtol: float
-    atol: float
-    norm: Callable[[PyTree], Float[Array, ""]]
+    _: KW_ONLY
+    num_samples: int = 8
+    sampler: AbstractSampler = Gaussian(antithetic=True)
+    baseline: str | AbstractBaseline = "mean"
+    batch_size: int | None = None
+    nonfinite: Literal["propagate", "drop"] = "propagate"
+    rtol: float = 0.0
+    atol: float = 0.0
+    norm: Callable[[PyTree], Float[Array, ""]] = optx.max_norm
 
-    def __init__(
-        self,
-        optim: optax.GradientTransformation,
-        sigma: PyTree,
-        *,
-        num_samples: int = 8,
-        sampler: AbstractSampler = Gaussian(antithetic=True),  # noqa: B008 (a frozen module)
-        baseline: str | AbstractBaseline = "mean",
-        batch_size: int | None = None,
-        nonfinite: Literal["propagate", "drop"] = "propagate",
-        rtol: float = 0.0,
-        atol: float = 0.0,
-        norm: Callable[[PyTree], Float[Array, ""]] = optx.max_norm,
-    ):
-        if not isinstance(optim, optax.GradientTransformation):
+    def __check_init__(self):
+        check_settings(self)
+        if not isinstance(self.optim, optax.GradientTransformation):
             raise TypeError(
-                f"optim must be an optax transformation such as optax.adam(0.1): {optim}"
+                f"optim must be an optax transformation such as optax.adam(0.1): {self.optim}"
             )
-        self.optim = optim
-        self.sigma = sigma
-        self.num_samples = num_samples
-        self.sampler = sampler
-        self.baseline = baseline
-        self.batch_size = batch_size
-        self.nonfinite = nonfinite
-        self.rtol = rtol
-        self.atol = atol
-        self.norm = norm
 
     def evaluations_per_step(self, y: PyTree[Array]) -> int:
         """One batch."""

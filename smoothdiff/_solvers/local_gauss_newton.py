@@ -1,6 +1,7 @@
 """Gauss-Newton in all places at once, where each parameter moves only some of the residuals."""
 
 from collections.abc import Callable
+from dataclasses import KW_ONLY
 from typing import Literal
 
 import equinox as eqx
@@ -15,6 +16,7 @@ from smoothdiff._solvers._base import (
     AbstractSmoothSolver,
     Progress,
     all_finite,
+    check_settings,
     promotion,
     read_options,
     smoothed_params,
@@ -128,47 +130,30 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     """
 
     sigma: PyTree
-    support: AbstractSupport
-    num_samples: int | None
-    sampler: AbstractSampler
-    batch_size: int | None
-    nonfinite: Literal["propagate", "drop"]
-    rtol: float
-    atol: float
-    norm: Callable[[PyTree], Float[Array, ""]]
+    support: Callable[[PyTree], Array]
+    _: KW_ONLY
+    num_samples: int | None = None
+    sampler: AbstractSampler = Gaussian()
+    batch_size: int | None = None
+    nonfinite: Literal["propagate", "drop"] = "propagate"
+    rtol: float = 0.0
+    atol: float = 0.0
+    norm: Callable[[PyTree], Float[Array, ""]] = optx.max_norm
 
-    def __init__(
-        self,
-        sigma: PyTree,
-        support: Callable[[PyTree], Array],
-        *,
-        num_samples: int | None = None,
-        sampler: AbstractSampler = Gaussian(),  # noqa: B008 (a frozen module)
-        batch_size: int | None = None,
-        nonfinite: Literal["propagate", "drop"] = "propagate",
-        rtol: float = 0.0,
-        atol: float = 0.0,
-        norm: Callable[[PyTree], Float[Array, ""]] = optx.max_norm,
-    ):
-        if num_samples is not None and num_samples < _TRIED + 3:
+    def __check_init__(self):
+        if self.num_samples is not None and self.num_samples < _TRIED + 3:
             raise ValueError(
-                f"num_samples={num_samples}: a step needs at least {_TRIED + 3} evaluations, "
+                f"num_samples={self.num_samples}: a step needs at least {_TRIED + 3} evaluations, "
                 f"as {_TRIED} of them are ends of steps that are tried"
             )
-        if nonfinite not in ("propagate", "drop"):
-            raise ValueError(f'nonfinite must be "propagate" or "drop", not {nonfinite!r}')
-        blame = as_support(support)
-        if blame is None:
+        check_settings(self)
+        self._blamed()
+
+    def _blamed(self) -> AbstractSupport:
+        support = as_support(self.support)
+        if support is None:
             raise TypeError("LocalGaussNewton needs a support; GaussNewton does without one")
-        self.sigma = sigma
-        self.support = blame
-        self.num_samples = num_samples
-        self.sampler = sampler
-        self.batch_size = batch_size
-        self.nonfinite = nonfinite
-        self.rtol = rtol
-        self.atol = atol
-        self.norm = norm
+        return support
 
     def evaluations_per_step(self, y: PyTree[Array]) -> int:
         """One batch, and the ends that are tried."""
@@ -183,14 +168,14 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         if self.num_samples is not None:
             return self.num_samples - _TRIED
         n = sum(leaf.size for leaf in jax.tree.leaves(y))
-        terms = jax.eval_shape(self.support.at(y), y).size
+        terms = jax.eval_shape(self._blamed().at(y), y).size
         affordable = int((_CUBES / max(terms, 1)) ** (1 / 3))
         return max(_FEWEST, min(n // 2, _MOST, affordable))
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> LocalGaussNewtonState:
         """Checks what can be looked at; evaluates nothing."""
         params = smoothed_params(self, y, jnp.asarray(0, jnp.int32), options)
-        terms = jax.eval_shape(self.support.at(y), y)
+        terms = jax.eval_shape(self._blamed().at(y), y)
         check_residuals(f_struct)
         leaves = jax.tree.leaves(f_struct)
         if len(leaves) != 1 or leaves[0].shape[: len(terms.shape)] != terms.shape:
@@ -209,7 +194,7 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         progress = state.progress
         params = smoothed_params(self, y, progress.step, options)
         residuals = Evaluator(fn, args, params, True, self.batch_size)
-        blame = Blame.of(self.support, params.layout.tree, params.theta)
+        blame = Blame.of(self._blamed(), params.layout.tree, params.theta)
         key = jax.random.fold_in(read_options(options)[0], progress.step)
         sigma = params.sigma * state.scale
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import KW_ONLY
 from typing import Any, Literal
 
 import jax
@@ -11,11 +12,10 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from smoothdiff._samplers import AbstractSampler
 from smoothdiff._solvers import _newton_batches, _point_by_point
-from smoothdiff._solvers._base import AbstractSmoothSolver, smoothed_params, stopped
+from smoothdiff._solvers._base import AbstractSmoothSolver, check_settings, smoothed_params, stopped
 from smoothdiff._solvers._evaluator import Evaluator
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._point_search import Sizes
-from smoothdiff._solvers._restarts import check_restarts
 from smoothdiff._solvers._value_search import ValueSearch
 
 # from so many parameters on, evaluations come in batches
@@ -101,47 +101,21 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     """
 
     sigma: PyTree
-    num_samples: int | None
-    history: int | None
-    sampler: AbstractSampler | None
-    nonfinite: Literal["propagate", "drop"]
-    rtol: float
-    atol: float
-    norm: Callable[[PyTree], Float[Array, ""]]
-    patience: int | None
-    restarts: int
+    _: KW_ONLY
+    num_samples: int | None = None
+    history: int | None = None
+    sampler: AbstractSampler | None = None
+    nonfinite: Literal["propagate", "drop"] = "propagate"
+    rtol: float = 0.0
+    atol: float = 0.0
+    norm: Callable[[PyTree], Float[Array, ""]] = optx.max_norm
+    patience: int | None = None
+    restarts: int = 0
 
-    def __init__(
-        self,
-        sigma: PyTree,
-        *,
-        num_samples: int | None = None,
-        history: int | None = None,
-        sampler: AbstractSampler | None = None,
-        nonfinite: Literal["propagate", "drop"] = "propagate",
-        rtol: float = 0.0,
-        atol: float = 0.0,
-        norm: Callable[[PyTree], Float[Array, ""]] = optx.max_norm,
-        patience: int | None = None,
-        restarts: int = 0,
-    ):
-        if num_samples is not None and num_samples < 1:
-            raise ValueError(f"num_samples={num_samples}: a step needs at least one evaluation")
-        if history is not None and history < 2:
-            raise ValueError(f"history must be at least 2, or None for the default: {history}")
-        check_restarts(patience, restarts)
-        if nonfinite not in ("propagate", "drop"):
-            raise ValueError(f'nonfinite must be "propagate" or "drop", not {nonfinite!r}')
-        self.sigma = sigma
-        self.num_samples = num_samples
-        self.history = history
-        self.sampler = sampler
-        self.nonfinite = nonfinite
-        self.rtol = rtol
-        self.atol = atol
-        self.norm = norm
-        self.patience = patience
-        self.restarts = restarts
+    def __check_init__(self):
+        check_settings(self)
+        if self.history is not None and self.history < 2:
+            raise ValueError(f"history must be at least 2, or None for the default: {self.history}")
 
     def _point_by_point(self, y: PyTree[Array]) -> bool:
         """Where there are few parameters, but for a schedule, which wants samples of its width."""

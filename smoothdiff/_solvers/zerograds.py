@@ -1,6 +1,7 @@
 """ZeroGrads: gradient descent on a surrogate that is fitted to the function as it goes."""
 
 from collections.abc import Callable
+from dataclasses import KW_ONLY
 from typing import Any, Literal
 
 import equinox as eqx
@@ -17,6 +18,7 @@ from smoothdiff._solvers._base import (
     AbstractSmoothSolver,
     Progress,
     all_finite,
+    check_settings,
     promotion,
     read_options,
     sigma_at,
@@ -123,83 +125,46 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
     """
 
     sigma: PyTree
-    surrogate: Callable[..., Any]
-    inner_sigma: PyTree
-    num_samples: int
-    surrogate_steps: int | None
-    replay: int | None
-    parameter_steps: int
-    surrogate_optimizer: optax.GradientTransformation
-    optimizer: optax.GradientTransformation | None
-    up_to_constant: bool | None
-    local: bool
-    log: bool
-    sampler: AbstractSampler
-    nonfinite: Literal["propagate", "drop"]
-    rtol: float
-    atol: float
-    norm: Callable[[PyTree], Float[Array, ""]]
+    _: KW_ONLY
+    surrogate: Callable[..., Any] = MLP
+    inner_sigma: PyTree = None
+    num_samples: int = 2
+    surrogate_steps: int | None = None
+    replay: int | None = None
+    parameter_steps: int = 1
+    surrogate_optimizer: optax.GradientTransformation = optax.adam(1e-3)
+    optimizer: optax.GradientTransformation | None = None
+    up_to_constant: bool | None = None
+    local: bool = True
+    log: bool = False
+    sampler: AbstractSampler = Gaussian(antithetic=True)
+    nonfinite: Literal["propagate", "drop"] = "propagate"
+    rtol: float = 0.0
+    atol: float = 0.0
+    norm: Callable[[PyTree], Float[Array, ""]] = optx.max_norm
 
-    def __init__(
-        self,
-        sigma: PyTree,
-        *,
-        surrogate: Callable[..., Any] = MLP,
-        inner_sigma: PyTree = None,
-        num_samples: int = 2,
-        surrogate_steps: int | None = None,
-        replay: int | None = None,
-        parameter_steps: int = 1,
-        surrogate_optimizer: optax.GradientTransformation = optax.adam(1e-3),  # noqa: B008
-        optimizer: optax.GradientTransformation | None = None,
-        up_to_constant: bool | None = None,
-        local: bool = True,
-        log: bool = False,
-        sampler: AbstractSampler = Gaussian(antithetic=True),  # noqa: B008 (a frozen module)
-        nonfinite: Literal["propagate", "drop"] = "propagate",
-        rtol: float = 0.0,
-        atol: float = 0.0,
-        norm: Callable[[PyTree], Float[Array, ""]] = optx.max_norm,
-    ):
-        for name, optim in {
-            "surrogate_optimizer": surrogate_optimizer,
-            "optimizer": optax.identity() if optimizer is None else optimizer,
-        }.items():
-            if not isinstance(optim, optax.GradientTransformation):
-                raise TypeError(
-                    f"{name} must be an optax transformation such as optax.adam(1e-3): {optim}"
-                )
-        for name, steps in (("surrogate", surrogate_steps), ("parameter", parameter_steps)):
+    def __check_init__(self):
+        check_settings(self)
+        for name in ("surrogate_optimizer", "optimizer"):
+            optim = getattr(self, name)
+            if not isinstance(optim, optax.GradientTransformation | None):
+                good = "an optax transformation such as optax.adam(1e-3)"
+                raise TypeError(f"{name} must be {good}: {optim}")
+        for name in ("surrogate_steps", "parameter_steps"):
+            steps = getattr(self, name)
             if steps is not None and steps < 1:
-                raise ValueError(f"{name}_steps must be at least 1, not {steps}")
-        if replay is not None and replay < 0:
-            raise ValueError(f"replay must be 0 batches or more, not {replay}")
-        if up_to_constant is not False and num_samples == 1:
+                raise ValueError(f"{name} must be at least 1, not {steps}")
+        if self.replay is not None and self.replay < 0:
+            raise ValueError(f"replay must be 0 batches or more, not {self.replay}")
+        if self.up_to_constant is not False and self.num_samples == 1:
             raise ValueError(
                 "one sample has no differences: use num_samples=2, or up_to_constant=False"
             )
-        if not callable(surrogate):
+        if not callable(self.surrogate):
             raise TypeError(
                 "surrogate must be a class or function to be called as surrogate(size, key=key), "
-                f"such as smoothdiff.surrogates.MLP, or an eqx.Module, not {surrogate!r}"
+                f"such as smoothdiff.surrogates.MLP, or an eqx.Module, not {self.surrogate!r}"
             )
-        self.sigma = sigma
-        self.surrogate = surrogate
-        self.inner_sigma = inner_sigma
-        self.num_samples = num_samples
-        self.surrogate_steps = surrogate_steps
-        self.replay = replay
-        self.parameter_steps = parameter_steps
-        self.surrogate_optimizer = surrogate_optimizer
-        self.optimizer = optimizer
-        self.up_to_constant = up_to_constant
-        self.local = local
-        self.log = log
-        self.sampler = sampler
-        self.nonfinite = nonfinite
-        self.rtol = rtol
-        self.atol = atol
-        self.norm = norm
 
     def evaluations_per_step(self, y: PyTree[Array]) -> int:
         """One batch."""
