@@ -1,8 +1,8 @@
 """Data profiles: how many problems of CUTEst and of COCO's BBOB are solved within a budget.
 
 Methods see residuals or numbers, exact, with noise, or rounded; the exact values are scored. A
-budget counts in units of n + 1 evaluations, for BBOB of n. `python -m benchmarks profiles bbob`
-runs one of the sets, residuals, scalars and bbob.
+budget counts in units of n + 1 evaluations, for BBOB of n. `python -m benchmarks profiles bbob5`
+runs one of the sets, residuals, scalars, and bbob5, bbob10 and bbob20 by the number of parameters.
 """
 
 import re

@@ -8,7 +8,7 @@ Noiseless Functions Definitions. INRIA RR-6829.
 
 import sys
 from collections.abc import Callable, Iterator
-from functools import cache
+from functools import cache, partial
 from itertools import product
 from types import ModuleType, SimpleNamespace
 from typing import Any, NamedTuple
@@ -80,14 +80,15 @@ def scalars(full: bool) -> Iterator[Panel]:
     yield Panel("scalars", "Scalars, sums of absolute values", kinks, budgets)
 
 
-def bbob(full: bool) -> Iterator[Panel]:
-    """Each start is drawn within the box."""
+def bbob(n: int, full: bool) -> Iterator[Panel]:
+    """Each start is drawn within the box. The quick setting has six functions in 5-D."""
+    if n > 5 and not full:
+        return
     cocoex = package("cocoex", "coco-experiment")
     numbers, instances = (range(1, 25), (1, 2, 3)) if full else ((1, 6, 8, 10, 15, 21), (1,))
-    for n in (5, 10, 20) if full else (5,):
-        cases = [_bbob(cocoex, f, n, instance) for f, instance in product(numbers, instances)]
-        budgets = (10, 100, 300, 1000) if full else (10, 100)
-        yield Panel("bbob", f"BBOB, {n}-D", cases, budgets, more=0, targets=TARGETS)
+    cases = [_bbob(cocoex, f, n, instance) for f, instance in product(numbers, instances)]
+    budgets = (10, 30, 100, 300, 1000) if full else (10, 100)
+    yield Panel("bbob", f"BBOB, {n}-D", cases, budgets, more=0, targets=TARGETS)
 
 
 def _bbob(cocoex: ModuleType, number: int, n: int, instance: int) -> Case:
@@ -165,4 +166,6 @@ def _sif2jax() -> ModuleType:
             del sys.modules[name]
 
 
-SETS = {"residuals": residuals, "scalars": scalars, "bbob": bbob}
+SETS = {"residuals": residuals, "scalars": scalars} | {
+    f"bbob{n}": partial(bbob, n) for n in (5, 10, 20)
+}
