@@ -32,6 +32,8 @@ _HIGH, _HIGHEST = 3.0, 1e6
 _RIDGE = {"float32": 1e-7, "float64": 1e-12}
 # the acceptance ratio of a step that fails, and of one after which the radius may grow
 _FAILED, _HELD = 0.1, 0.7
+# a step that raises the function by so many times what it was to fall was far too long
+_FAR_OFF = 10.0
 # an evaluation so many radii away should make way for a nearer one
 _FAR = 2.0
 # so many steps that fail in a row are too many for now, and so many evaluations for each parameter,
@@ -210,10 +212,13 @@ class QuadraticTrust(eqx.Module):
         tried = reduction > 0
         ratio = jnp.where(tried, (before - fun) / jnp.where(tried, reduction, 1), 0)
         failed = tried & ~(ratio > _FAILED)
-        fails = jnp.where(failed, self.fails + 1, jnp.where(tried, 0, self.fails))
+        # then the scale is wrong, which says nothing against the model
+        long = failed & jnp.isfinite(ratio) & (ratio < -_FAR_OFF)
+        wrong = failed & ~long
+        fails = jnp.where(wrong, self.fails + 1, jnp.where(tried & ~failed, 0, self.fails))
         # a model of far points is made better before it is trusted less
-        wait = proposal.poor & (fails < 2)
-        lower = jnp.minimum(self.radius, length) / 2
+        wait = proposal.poor & (fails < 2) & ~long
+        lower = jnp.minimum(self.radius, length) * jnp.where(long, 0.1, 0.5)
         radius = jnp.where(failed & ~wait, lower, self.radius)
         radius = jnp.where(tried & (ratio > _HELD), jnp.maximum(radius, 2 * length), radius)
         radius = jnp.where(~tried & ~self.improve, self.radius / 2, radius)
