@@ -88,6 +88,10 @@ def test_the_radius_follows_the_ratio_and_the_metric_the_hessian(x64):
     assert kept.radius > 0.06
     assert outcome(fun + 1).radius < 0.03
     assert outcome(np.inf).fails == 1
+    # a step that was far too long says nothing against the model
+    long = outcome(fun + 100 * float(proposal.reduction[0]))
+    assert long.fails == 0
+    assert long.radius < 0.006
     # towards the shape in which the Hessian is round
     before, after = (np.linalg.cond(h) for h in (proposal.hessian, kept.hessian))
     assert after < before

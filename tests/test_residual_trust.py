@@ -147,6 +147,15 @@ def test_steps_that_change_nothing_or_are_predicted_no_better_are_rough():
     assert not outcome(1.0, worked).failed()
 
 
+def test_a_step_that_was_far_too_long_says_nothing_against_the_model():
+    long = outcome(50.0)
+    assert (long.fails, long.rough) == (0, 0)
+    assert long.radius == pytest.approx(0.1)
+    # nor does it say anything for it
+    assert outcome(50.0, outcome(1.2)).fails == 1
+    assert outcome(jnp.inf).fails == 1
+
+
 def test_the_best_point_stays_in_the_history(x64):
     history = known([[0.0, 0, 0]])
     best = jnp.asarray([[0.5, 0.5, 0.5]])

@@ -32,6 +32,8 @@ _PREDICTED = 0.5
 _COVERED = 0.2
 # ... and evaluations cover the region, or this share of what the fit uses
 _CLOSE = 0.05
+# a step that raises the loss by so many times what it was to fall was far too long
+_FAR_OFF = 10.0
 # the radius after a failure, in lengths of the step
 _SMALLEST, _LARGEST = 0.1, 0.5
 # so many steps in a row that fail, or fail and are rough, are too many; of the latter one, where no
@@ -167,17 +169,20 @@ class TrustRegion(eqx.Module):
         same = jnp.all(rows[best] == row)
         tried = reduction > 0
         failed = tried & ~(ratio > _FAILED)
-        fails = jnp.where(failed, self.fails + 1, jnp.where(tried, 0, self.fails))
+        # then the scale is wrong, which says nothing against the model
+        long = failed & jnp.isfinite(ratio) & (ratio < -_FAR_OFF)
+        wrong = failed & ~long
+        fails = jnp.where(wrong, self.fails + 1, jnp.where(tried & ~failed, 0, self.fails))
         shorter = (self.fails > 0) & (length < _SHORTER * self.length)
         more = same | (shorter & (error >= _SMOOTH * self.error))
         rough = jnp.where(more, self.rough + 1, self.rough)
-        rough = jnp.asarray(jnp.where(failed, rough, jnp.where(tried, 0, self.rough)))
+        rough = jnp.where(tried & ~failed, 0, jnp.where(wrong, rough, self.rough))
         # the lowest point of the parabola through both values and the slope
         slope = proposal.slope[best]
         share = slope / jnp.maximum(2 * (fun - before + slope), tiny)
         share = jnp.clip(jnp.where(jnp.isfinite(fun), share, 0), _SMALLEST, _LARGEST)
         lower = jnp.minimum(self.radius, length) * share
-        wait = proposal.poor & (fails < 2) & ~self.improve
+        wait = proposal.poor & (fails < 2) & ~self.improve & ~long
         radius = jnp.where(failed & ~wait, lower, self.radius)
         grow = tried & (ratio > _HELD) & (error < _PREDICTED)
         radius = jnp.where(grow, jnp.maximum(radius, 2 * length), radius)
