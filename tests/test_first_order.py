@@ -241,8 +241,8 @@ def test_bad_options_are_refused(options, error, match):
     ],
 )
 def test_bad_settings_are_refused(change, match):
-    solver = sd.FirstOrder(optax.sgd(0.1), **{"sigma": 0.1, **change})
     with pytest.raises(ValueError, match=match):
+        solver = sd.FirstOrder(optax.sgd(0.1), **{"sigma": 0.1, **change})
         run(bowl, solver, jnp.zeros(2), TARGET)
 
 
