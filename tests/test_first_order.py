@@ -241,9 +241,9 @@ def test_bad_options_are_refused(options, error, match):
     ],
 )
 def test_bad_settings_are_refused(change, match):
+    settings = {"sigma": 0.1, **change}
     with pytest.raises(ValueError, match=match):
-        solver = sd.FirstOrder(optax.sgd(0.1), **{"sigma": 0.1, **change})
-        run(bowl, solver, jnp.zeros(2), TARGET)
+        run(bowl, sd.FirstOrder(optax.sgd(0.1), **settings), jnp.zeros(2), TARGET)
 
 
 def test_what_is_no_optax_transformation_is_refused():
