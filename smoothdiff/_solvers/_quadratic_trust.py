@@ -21,6 +21,7 @@ from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._point_search import nothing, powers_of_two
+from smoothdiff._solvers._ratio_test import ratio_test
 
 # the most evaluations that a model interpolates, if n parameters do not need more
 _MOST = 256
@@ -30,10 +31,6 @@ _FARTHEST = 3.0
 _HIGH, _HIGHEST = 3.0, 1e6
 # the errors of the others, against the squared distances
 _RIDGE = {"float32": 1e-7, "float64": 1e-12}
-# the acceptance ratio of a step that fails, and of one after which the radius may grow
-_FAILED, _HELD = 0.1, 0.7
-# a step that raises the function by so many times what it was to fall was far too long
-_FAR_OFF = 10.0
 # an evaluation so many radii away should make way for a nearer one
 _FAR = 2.0
 # so many steps that fail in a row are too many for now, and so many evaluations for each parameter,
@@ -209,18 +206,12 @@ class QuadraticTrust(eqx.Module):
             lambda a, b: jnp.where(usable, a, b), (metric, turn), (self.metric, still)
         )
         length = jnp.linalg.norm(turn.into(proposal.steps[best]))
-        tried = reduction > 0
-        ratio = jnp.where(tried, (before - fun) / jnp.where(tried, reduction, 1), 0)
-        failed = tried & ~(ratio > _FAILED)
-        # then the scale is wrong, which says nothing against the model
-        long = failed & jnp.isfinite(ratio) & (ratio < -_FAR_OFF)
-        wrong = failed & ~long
-        fails = jnp.where(wrong, self.fails + 1, jnp.where(tried & ~failed, 0, self.fails))
+        tried, failed, held, long, fails = ratio_test(before, fun, reduction, self.fails)
         # a model of far points is made better before it is trusted less
         wait = proposal.poor & (fails < 2) & ~long
         lower = jnp.minimum(self.radius, length) * jnp.where(long, 0.1, 0.5)
         radius = jnp.where(failed & ~wait, lower, self.radius)
-        radius = jnp.where(tried & (ratio > _HELD), jnp.maximum(radius, 2 * length), radius)
+        radius = jnp.where(held, jnp.maximum(radius, 2 * length), radius)
         radius = jnp.where(~tried & ~self.improve, self.radius / 2, radius)
         return QuadraticTrust(
             metric=metric,

@@ -19,21 +19,18 @@ from smoothdiff._solvers._base import dot
 from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._point_search import powers_of_two
+from smoothdiff._solvers._ratio_test import ratio_test
 
 # evaluations that a fit may use for each parameter, and how far they count, in radii
 _USED, _REACH, _FARTHEST = 3, 1.5, 2.0
 # what is not known of a direction that hardly any evaluation has, against the others, squared
 _RIDGE = 1e-8
-# the acceptance ratio of a step that fails, and of one after which the radius may grow
-_FAILED, _HELD = 0.1, 0.7
-# ... if the change of the residuals was predicted with an error below this share
+# the radius grows only if the change of the residuals was predicted with an error below this share
 _PREDICTED = 0.5
 # a direction with less than this share of the radius is not covered by evaluations
 _COVERED = 0.2
 # ... and evaluations cover the region, or this share of what the fit uses
 _CLOSE = 0.05
-# a step that raises the loss by so many times what it was to fall was far too long
-_FAR_OFF = 10.0
 # the radius after a failure, in lengths of the step
 _SMALLEST, _LARGEST = 0.1, 0.5
 # so many steps in a row that fail, or fail and are rough, are too many; of the latter one, where no
@@ -161,22 +158,16 @@ class TrustRegion(eqx.Module):
         fun, reduction = funs[best], proposal.reduction[best]
         length: Array = jnp.linalg.norm(proposal.steps[best])
         tiny = jnp.finfo(row.dtype).tiny
-        ratio = jnp.where(reduction > 0, (before - fun) / jnp.maximum(reduction, tiny), 0)
         off = jnp.linalg.norm(rows[best] - proposal.predicted[best])
         expected = jnp.linalg.norm(proposal.predicted[best] - row)
         error = off / jnp.maximum(expected, tiny)
         error = jnp.asarray(jnp.where(jnp.isfinite(fun), error, jnp.inf))
         same = jnp.all(rows[best] == row)
-        tried = reduction > 0
-        failed = tried & ~(ratio > _FAILED)
-        # then the scale is wrong, which says nothing against the model
-        long = failed & jnp.isfinite(ratio) & (ratio < -_FAR_OFF)
-        wrong = failed & ~long
-        fails = jnp.where(wrong, self.fails + 1, jnp.where(tried & ~failed, 0, self.fails))
+        tried, failed, held, long, fails = ratio_test(before, fun, reduction, self.fails)
         shorter = (self.fails > 0) & (length < _SHORTER * self.length)
         more = same | (shorter & (error >= _SMOOTH * self.error))
         rough = jnp.where(more, self.rough + 1, self.rough)
-        rough = jnp.where(tried & ~failed, 0, jnp.where(wrong, rough, self.rough))
+        rough = jnp.where(tried & ~failed, 0, jnp.where(failed & ~long, rough, self.rough))
         # the lowest point of the parabola through both values and the slope
         slope = proposal.slope[best]
         share = slope / jnp.maximum(2 * (fun - before + slope), tiny)
@@ -184,7 +175,7 @@ class TrustRegion(eqx.Module):
         lower = jnp.minimum(self.radius, length) * share
         wait = proposal.poor & (fails < 2) & ~self.improve & ~long
         radius = jnp.where(failed & ~wait, lower, self.radius)
-        grow = tried & (ratio > _HELD) & (error < _PREDICTED)
+        grow = held & (error < _PREDICTED)
         radius = jnp.where(grow, jnp.maximum(radius, 2 * length), radius)
         radius = jnp.where(~tried & ~self.improve, 0.5 * radius, radius)
         improve = failed & proposal.poor & ~self.improve

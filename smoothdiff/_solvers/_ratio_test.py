@@ -1,0 +1,51 @@
+"""The ratio test of a trust region: what the value at the end of a step says of the model."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+# the acceptance ratio of a step that fails, and of one after which the radius may grow
+_FAILED, _HELD = 0.1, 0.7
+# a step that raises the function by so many times the predicted reduction was far too long
+_FAR_OFF = 10.0
+
+
+class Outcome(NamedTuple):
+    """What came of a step; all are false where none was `tried`, as for a point of geometry.
+
+    A step that `failed` may have been `long`: far too long. Then the scale is wrong, which says
+    nothing against the model. `fails` counts the other failures in a row.
+    """
+
+    tried: Bool[Array, ""]
+    failed: Bool[Array, ""]
+    held: Bool[Array, ""]
+    long: Bool[Array, ""]
+    fails: Int[Array, ""]
+
+
+def ratio_test(
+    before: Float[Array, ""],
+    fun: Float[Array, ""],
+    reduction: Float[Array, ""],
+    fails: Int[Array, ""],
+) -> Outcome:
+    r"""The outcome by the acceptance ratio, actual over predicted reduction.
+
+    $$ \rho = \frac{f(x) - f(x + p)}{m(x) - m(x + p)} $$
+
+    Args:
+        before: the value where the step began.
+        fun: the value at its end, infinite where there is none.
+        reduction: what the model predicted; zero where no step was tried.
+        fails: the failures in a row before this step.
+
+    Source: the test is that of Powell 1975; that a step far too long is no failure is our own.
+    """
+    tried = reduction > 0
+    ratio = jnp.where(tried, (before - fun) / jnp.where(tried, reduction, 1), 0)
+    failed = tried & ~(ratio > _FAILED)
+    long = failed & jnp.isfinite(ratio) & (ratio < -_FAR_OFF)
+    count = jnp.where(failed & ~long, fails + 1, jnp.where(tried & ~failed, 0, fails))
+    return Outcome(tried, failed, tried & (ratio > _HELD), long, count)
