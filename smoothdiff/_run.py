@@ -23,7 +23,7 @@ _DEFAULT_STEPS = 256
 _SAVING = 0.05
 _NONFINITE = (
     "an estimate was NaN or infinite; `result` has what was found before. If fun fails for some "
-    'samples, give the solver nonfinite="drop", which leaves them out as long as half are finite; '
+    'samples, give the solver nonfinite="drop", which leaves them out unless they are too many; '
     "if the iterates run away, take smaller steps or set bounds"
 )
 

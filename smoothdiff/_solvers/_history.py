@@ -57,10 +57,6 @@ class History(eqx.Module):
         known = jnp.any(self.valid)
         return jnp.where(known, self.points[i], start), self.rows[i], self.funs[i]
 
-    def mostly_valid(self, count: int) -> Bool[Array, ""]:
-        """Whether at least half of the last so many are valid."""
-        return 2 * jnp.sum(self.valid[-count:]) >= count
-
     def _known(self) -> Float[Array, " M"]:
         return jnp.where(self.valid, self.funs, jnp.inf)
 

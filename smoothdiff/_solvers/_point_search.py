@@ -52,8 +52,11 @@ class AbstractPointSearch(eqx.Module):
         """Another search, from elsewhere or from where the run began, with other random numbers."""
 
     @abc.abstractmethod
-    def width(self) -> Float[Array, ""]:
-        """How far from the iterate the function is looked at, relative to sigma."""
+    def width(self) -> Float[Array, "..."]:
+        """How far from the iterate the function is looked at, relative to sigma.
+
+        One number, or one for each parameter.
+        """
 
     @abc.abstractmethod
     def propose(
@@ -105,8 +108,8 @@ class AbstractPointSearch(eqx.Module):
         return eqx.tree_at(lambda s: s.history, self, history)
 
     def enough(self, count: int) -> Bool[Array, ""]:
-        """Whether half of the last so many evaluations gave numbers, once there are so many."""
-        return (self.evaluated < count) | self.history.mostly_valid(count)
+        """Whether any of the last so many evaluations gave numbers, once there are so many."""
+        return (self.evaluated < count) | jnp.any(self.history.valid[-count:])
 
     def converged(self) -> Bool[Array, ""]:
         """Whether the last steps were small."""

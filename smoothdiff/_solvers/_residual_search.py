@@ -1,11 +1,13 @@
 """One search of Gauss-Newton with few parameters: first points, a trust region, wide regressions.
 
-The function is evaluated at the start and one sigma from it along each parameter. Then a model of
-the residuals around the best point says where to evaluate next, while it predicts what comes. Where
-its steps fail in a row, or most residuals do not move, a wide regression takes over: rounds of
-samples around a center, which may go uphill, until its steps come true.
+The function is evaluated at the start and one sigma from it along each parameter, or nearer where
+that is far too long. Then a model of the residuals around the best point says where to evaluate
+next, while it predicts what comes. Where its steps fail in a row, or most residuals do not move, a
+wide regression takes over: rounds of samples around a center, which may go uphill, until its steps
+come true or have led to nothing.
 """
 
+import dataclasses
 from collections.abc import Callable
 
 import equinox as eqx
@@ -14,13 +16,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
+from smoothdiff._solvers._first_points import FirstPoints
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._point_search import FIRST, TRUST, WIDE, AbstractPointSearch, Sizes
 from smoothdiff._solvers._residual_trust import Proposal, TrustRegion
 from smoothdiff._solvers._wide_rounds import Wide, further, sides_of
 
 # evaluations of wide rounds since the last lower point, for each parameter, until the local model
-# is tried there, and its radius then, in widths
+# goes on: around a lower point that they found with a radius of so many widths, else as it was
 _IDLE, _NARROWER = 6, 0.1
 # so many steps in a row that halve the loss, within the width, are trusted again
 _TRUE = 2
@@ -29,6 +32,7 @@ _TRUE = 2
 class ResidualSearch(AbstractPointSearch):
     """Where a search stands, with the local model and the wide one."""
 
+    first: FirstPoints
     trust: TrustRegion
     wide: Wide
 
@@ -42,6 +46,7 @@ class ResidualSearch(AbstractPointSearch):
             history=history,
             start=theta,
             evaluated=none,
+            first=FirstPoints.start(theta),
             trust=TrustRegion.start(one, n, size),
             wide=Wide.start(theta, jnp.zeros(size, theta.dtype), one),
             small=none,
@@ -66,16 +71,24 @@ class ResidualSearch(AbstractPointSearch):
 
     def smoothing(self) -> Float[Array, ""]:
         """Half the squares of what the linear model adds."""
-        return jnp.sum((self.trust.jacobian * self.width()) ** 2) / 2
+        return jnp.sum((self.trust.jacobian * self._radius()) ** 2) / 2
 
-    def width(self) -> Float[Array, ""]:
+    def width(self) -> Float[Array, " n"]:
         """How far from the iterate the function is looked at, relative to sigma."""
+        return self.first.reach * self._radius()
+
+    def _radius(self) -> Float[Array, ""]:
         return jnp.where(self.stage == WIDE, self.wide.scale, self.trust.radius)
+
+    def _scaled(self, params: Params) -> Params:
+        """With a smaller sigma where the first points said so."""
+        return dataclasses.replace(params, sigma=params.sigma * self.first.reach)
 
     def propose(
         self, params: Params, draw: Callable[[int], Float[Array, "k n"]], sizes: Sizes
     ) -> tuple[Float[Array, "K n"], Proposal]:
         """The first points, the end of a step, or the next samples of a round."""
+        params = self._scaled(params)
         sigma = params.sigma
         count, size = sizes.step, self.history.rows.shape[1]
         n, dtype = len(sigma), sigma.dtype
@@ -95,10 +108,12 @@ class ResidualSearch(AbstractPointSearch):
             if low is not None and high is not None:
                 units = jnp.where(((high >= 1) | (high >= -low))[:, None], units, -units)
             table = jnp.concatenate([jnp.zeros((1, n), dtype), units])
+            at, taken = self.first.next(count)
+            points = table[at]
             if count > 1:
-                table = jnp.concatenate([table, draw(max(sizes.first - 1, 1))])
-            at = jnp.minimum(self.evaluated + slot, len(table) - 1)
-            return self.start[None] + sigma[None] * table[at], nothing
+                others = draw(max(sizes.first - 1, 1))
+                points = jnp.where(taken[:, None], points, others[slot % len(others)])
+            return self.start[None] + sigma[None] * points, nothing
 
         def local() -> tuple[Array, Proposal]:
             center, row, _ = self.history.best(self.start)
@@ -127,10 +142,11 @@ class ResidualSearch(AbstractPointSearch):
         sizes: Sizes,
     ) -> "ResidualSearch":
         """The search with these residuals at these points."""
+        params = self._scaled(params)
         here = self.history.best(self.start)
         with_rows = self.kept(new)
         by_stage = [
-            lambda: with_rows._after_first(sizes),
+            lambda: with_rows._after_first(jnp.where(new.valid, new.funs, jnp.inf)),
             lambda: with_rows._after_local(here[1], new.rows, new.valid, proposal),
             lambda: with_rows._after_wide(params, new.rows, new.valid, sizes),
         ]
@@ -146,14 +162,14 @@ class ResidualSearch(AbstractPointSearch):
         stage = jnp.full_like(self.stage, WIDE)
         return eqx.tree_at(lambda s: (s.stage, s.wide), self, (stage, wide))
 
-    def _after_first(self, sizes: Sizes) -> "ResidualSearch":
-        enough = self.evaluated + sizes.step > len(self.start)
-        stage = jnp.where(enough, TRUST, FIRST).astype(self.stage.dtype)
-        known = eqx.tree_at(lambda s: s.stage, self, stage)
+    def _after_first(self, funs: Float[Array, " K"]) -> "ResidualSearch":
+        first = self.first.after(funs)
+        stage = jnp.where(first.done(), TRUST, FIRST).astype(self.stage.dtype)
+        known = eqx.tree_at(lambda s: (s.stage, s.first), self, (stage, first))
         _, row, _ = self.history.best(self.start)
         moved = jnp.any(self.history.rows != row[None], axis=1) & self.history.valid
         few = 2 * (1 + jnp.sum(moved)) <= jnp.sum(self.history.valid)
-        return _where(enough & few, known._to_wide(jnp.ones_like(self.wide.scale)), known)
+        return _where(first.done() & few, known._to_wide(jnp.ones_like(self.wide.scale)), known)
 
     def _after_local(
         self, row: Array, rows: Array, good: Array, proposal: Proposal
@@ -189,18 +205,21 @@ class ResidualSearch(AbstractPointSearch):
         search = eqx.tree_at(
             lambda s: s.wide, self, jax.lax.cond(taken >= wanted, moved, lambda: wide)
         )
-        tired = found & (idle >= _IDLE * (len(self.start) + 1))
+        came_true = true >= _TRUE
+        # the local model begins anew around what was found, or goes on
         radius = jnp.where(
-            true >= _TRUE,
+            came_true,
             2 * jnp.linalg.norm(wide.move / params.sigma),
             _NARROWER * jnp.minimum(wide.scale, 1),
         )
         radius = jnp.maximum(jnp.asarray(radius), jnp.finfo(fun.dtype).eps)
-        trust = TrustRegion.start(jnp.asarray(radius), len(self.start), self.history.rows.shape[1])
-        back = eqx.tree_at(
-            lambda s: (s.stage, s.trust), self, (jnp.full_like(self.stage, TRUST), trust)
+        anew = TrustRegion.start(jnp.asarray(radius), *self.trust.jacobian.shape)
+        trust = jax.tree.map(
+            lambda a, b: jnp.where(came_true | found, a, b), anew, self.trust.resumed()
         )
-        return _where((true >= _TRUE) | tired, back, search)
+        stage = jnp.full_like(self.stage, TRUST)
+        back = eqx.tree_at(lambda s: (s.stage, s.trust), self, (stage, trust))
+        return _where(came_true | (idle >= _IDLE * (len(self.start) + 1)), back, search)
 
 
 def _where(condition: Array, a: ResidualSearch, b: ResidualSearch) -> ResidualSearch:

@@ -61,7 +61,8 @@ class TrustRegion(eqx.Module):
     `fails` counts the steps in a row that failed, `rough` those of them that were shorter than the
     one before and predicted no better, as happens where a function jumps, or changed nothing at
     all; `error` and `length` are those of the last one. `worked` says that some step did not fail,
-    and `slow` counts the evaluations in a row that lowered the loss by little or nothing.
+    and `slow` counts the evaluations in a row that lowered the loss by little or nothing, while the
+    radius did not grow.
     """
 
     radius: Float[Array, ""]
@@ -88,6 +89,16 @@ class TrustRegion(eqx.Module):
             (self.fails >= _FAILS)
             | (self.slow >= _SLOW * (len(self.jacobian) + 1))
             | (self.rough >= jnp.where(self.worked, _ROUGH, 1))
+        )
+
+    def resumed(self) -> "TrustRegion":
+        """After a turn of the other model: what failed before no longer counts."""
+        none = jnp.zeros_like(self.fails)
+        no, yes = jnp.zeros_like(self.improve), jnp.ones_like(self.worked)
+        return eqx.tree_at(
+            lambda t: (t.fails, t.rough, t.slow, t.improve, t.worked),
+            self,
+            (none, none, none, no, yes),
         )
 
     def propose(
@@ -187,7 +198,7 @@ class TrustRegion(eqx.Module):
             rough=rough.astype(fails.dtype),
             error=jnp.where(failed, error, self.error),
             length=jnp.where(failed, length, self.length),
-            slow=jnp.where(fun < (1 - _LITTLE) * before, 0, self.slow + len(rows)),
+            slow=jnp.where((fun < (1 - _LITTLE) * before) | grow, 0, self.slow + len(rows)),
             worked=self.worked | (tried & ~failed),
         )
         return revised

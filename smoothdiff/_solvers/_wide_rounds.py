@@ -64,6 +64,9 @@ class Wide(eqx.Module):
         # a few that are the same call for more of them first
         flat = same & ~self.seen
         scale = next_scale(self.scale, flat, history, here, u, error, longest / LONGEST)
+        # where most samples gave no numbers they were too far away
+        few = 2 * jnp.sum(fresh) < count
+        scale = jnp.where(few, self.scale / 2, scale)
         finite = jnp.all(jnp.isfinite(theta)) & jnp.isfinite(scale)
         return Wide(
             center=jnp.where(finite, theta, center),

@@ -31,20 +31,22 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     teaches all of them. What is sought is a small sum of squares, $\min_y \frac12 \sum_p r_p(y)^2$.
 
     With fewer than 100 parameters the function is evaluated point by point. The first points are
-    the start, and one sigma from it along each parameter. From then on a step needs one
-    evaluation: J is the fit to the nearest points that differs least from the last J, $y_t$ is the
-    best point, and the radius $\Delta$ grows where the residuals come as predicted and shrinks
-    where the loss does not fall. Where steps fail in a row, a shorter step is predicted no better
-    than a longer one, or residuals do not change at all, as on functions that jump, a wide
-    regression takes over. It samples rounds of points around a center, which may go uphill:
+    the start, and one sigma from it along each parameter. Where the loss there is more than ten
+    times as high, a nearer point follows, and all widths of that parameter are as much smaller.
+    From then on a step needs one evaluation: J is the fit to the nearest points that differs least
+    from the last J, $y_t$ is the best point, and the radius $\Delta$ grows where the residuals come
+    as predicted and shrinks where the loss does not fall. Where steps fail in a row, a shorter step
+    is predicted no better than a longer one, or residuals do not change at all, as on functions
+    that jump, a wide regression takes over. It samples rounds of points around a center, which may
+    go uphill:
 
     $$ r(y + \sigma u) \approx m + J u + e, \qquad
        u = -(J^T \Gamma^{-1} J + I)^{-1} J^T \Gamma^{-1} m $$
 
     $\Gamma$, the covariance of what a linear model of the last `history` evaluations leaves, is the
     metric: pixels that jump at random have no say, and where all do, the step is damped as by
-    Levenberg and Marquardt. Once two of its steps in a row come true, the local model is trusted
-    again.
+    Levenberg and Marquardt. Once two of its steps in a row come true, or 6 (n + 1) evaluations
+    have led to nothing lower, the local model goes on.
 
     With 100 parameters and more, or with a schedule of sigma, each step takes a batch, and the
     wide regression alone. Where a batch says little about each of so many parameters, 12 of the
@@ -71,8 +73,9 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         sampler: where to sample. By default `Sobol`, for 100 parameters and more `Gaussian`, as
             few Sobol points in many dimensions make parameters look alike.
         batch_size: evaluate at most so many samples at a time, as for `smooth`.
-        nonfinite: "propagate" or "drop" samples with a NaN or an infinity in their residuals; as
-            long as half of a round are finite. The end of a step that is tried may be anything.
+        nonfinite: "propagate" or "drop" samples with a NaN or an infinity in their residuals; a
+            round that loses half of them is followed by a narrower one. The end of a step that is
+            tried may be anything.
         rtol: relative tolerance. The run has converged when three steps in a row and their width
             are below `atol + rtol * norm(y)`.
         atol: absolute tolerance. By default both are zero, and the run uses up its budget.
@@ -143,7 +146,7 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         n = sum(leaf.size for leaf in jax.tree.leaves(y))
         first = self.num_samples or 4 + int(3 * math.log(n))
         # what the history has need not be seen again
-        later = first if self.num_samples else min(first, max(2, n))
+        later = first if self.num_samples else min(first, max(4, n))
         patience = self.patience or _point_by_point.PATIENCE * (n + 1)
         return Sizes(self.num_samples or 1, first, later, patience)
 

@@ -1,0 +1,66 @@
+"""The first points of a search for residuals: the start, and one along each parameter.
+
+Sigma may suit one parameter and be far too large for another. Where the point along a parameter is
+far higher than the start, it says nothing of the slope there, so a nearer one takes its place, and
+the parameter has so much smaller steps from then on.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+# a loss so many times that at the start is far higher; linear residuals that are tried again at the
+# length that is worked out below give at most four times that
+_HIGH = 10.0
+# so often a parameter is tried; at a value that is not finite it comes so much nearer, else at most
+# so much
+_TRIES, _NEARER, _NEAREST = 4, 0.1, 1e-6
+
+
+class FirstPoints(eqx.Module):
+    """What is still to be evaluated: `left` counts the tries of the start and of each parameter.
+
+    `reach` is the length of the step along each parameter, in units of its sigma, and `before` the
+    loss at the start.
+    """
+
+    reach: Float[Array, " n"]
+    left: Int[Array, " n+1"]
+    before: Float[Array, ""]
+
+    @staticmethod
+    def start(theta: Float[Array, " n"]) -> "FirstPoints":
+        """Nothing has been evaluated."""
+        left = jnp.full(len(theta) + 1, _TRIES, jnp.int32)
+        return FirstPoints(jnp.ones_like(theta), left, jnp.asarray(jnp.inf, theta.dtype))
+
+    def done(self) -> Bool[Array, ""]:
+        """Whether no point is left."""
+        return jnp.all(self.left == 0)
+
+    def next(self, count: int) -> tuple[Int[Array, " K"], Bool[Array, " K"]]:
+        """Which points come next, 0 for the start, and which of these places are taken at all."""
+        order = jnp.argsort(self.left == 0, stable=True)
+        slot = jnp.arange(count, dtype=jnp.int32)
+        at = order[jnp.minimum(slot, len(order) - 1)].astype(jnp.int32)
+        return at, slot < jnp.sum(self.left > 0, dtype=jnp.int32)
+
+    def after(self, funs: Float[Array, " K"]) -> "FirstPoints":
+        r"""With these losses, infinite where there is none.
+
+        Linear residuals r + t d have their lowest loss along d within |r| / |d|, which a loss far
+        above that at the start tells: t = sqrt(loss at the start / loss).
+        """
+        at, taken = self.next(len(funs))
+        start = taken & (at == 0)
+        before = jnp.where(jnp.any(start), jnp.min(jnp.where(start, funs, jnp.inf)), self.before)
+        high = ~(funs <= _HIGH * before) & jnp.isfinite(before) & (before > 0) & ~start
+        finite = jnp.isfinite(funs)
+        nearer = jnp.sqrt(before / jnp.where(finite & high, funs, 1))
+        nearer = jnp.where(finite, jnp.maximum(nearer, _NEAREST), _NEARER)
+        tries = jnp.where(high, self.left[at] - 1, 0)
+        nearer = jnp.where(high & (tries > 0), nearer, 1)
+        # an index beyond the end is dropped
+        left = self.left.at[jnp.where(taken, at, len(self.left))].set(tries, mode="drop")
+        along = jnp.where(taken & (at > 0), at - 1, len(self.reach))
+        return FirstPoints(self.reach.at[along].multiply(nearer, mode="drop"), left, before)

@@ -1,0 +1,95 @@
+"""The first points of a search for residuals: each parameter gets a step that suits it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import smoothdiff as sd
+from smoothdiff._solvers._first_points import FirstPoints
+
+START = np.array([1.0, -2.0, 0.5])
+
+
+def measured(losses, count=1):
+    """All the first points, so many at once; `losses(reach)` has the start's, then each step's."""
+    first, evaluated = FirstPoints.start(jnp.zeros(3)), []
+    while not bool(first.done()):
+        at, taken = (np.asarray(a) for a in first.next(count))
+        evaluated += at[taken].tolist()
+        funs = np.asarray(losses(np.asarray(first.reach)))[at]
+        first = first.after(jnp.asarray(np.where(taken, funs, 0.0)))
+    return np.asarray(first.reach), evaluated
+
+
+def linear(slopes):
+    """Half the squares of residuals that are linear in each parameter."""
+
+    def losses(reach):
+        rows = START[None] + reach[:, None] * np.diag(slopes)
+        return [START @ START / 2, *np.sum(rows**2, axis=1) / 2]
+
+    return losses
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_a_parameter_of_another_scale_gets_a_nearer_point(count, x64):
+    reach, evaluated = measured(linear([1.0, 1e5, -3.0]), count)
+    assert sorted(evaluated) == [0, 1, 2, 2, 3]
+    np.testing.assert_array_equal(reach[[0, 2]], 1)
+    assert reach[1] == pytest.approx(np.linalg.norm(START) / 1e5, rel=0.01)
+
+
+def test_where_there_is_no_number_the_next_point_is_a_tenth_as_far(x64):
+    def losses(reach):
+        return [1.0, 1.0, np.inf if reach[1] > 0.05 else 1.0, np.inf]
+
+    reach, evaluated = measured(losses)
+    np.testing.assert_allclose(reach, [1, 0.01, 1e-3])
+    assert evaluated == [0, 1, 2, 2, 2, 3, 3, 3, 3]
+
+
+def test_a_start_without_a_number_asks_for_nothing_nearer():
+    _, evaluated = measured(lambda reach: [np.inf, 1e9, 1.0, 1.0])
+    assert evaluated == [0, 1, 2, 3]
+
+
+def model(y, _):
+    """A decay whose rate is a thousand times as small as its amplitude, as in NIST's KIRBY2."""
+    t = jnp.linspace(0, 100.0, 40)
+    return y[0] * jnp.exp(jnp.clip(y[1] * t, -60, 60)) - 80 * jnp.exp(-0.03 * t)
+
+
+def test_one_sigma_for_parameters_of_different_scales(x64):
+    y0 = jnp.array([60.0, -0.001])
+    loss = lambda y: float(jnp.sum(model(y, None) ** 2))
+    result = sd.least_squares(
+        model, y0, key=jax.random.key(0), solver=sd.GaussNewton(6.0), max_evaluations=40
+    )
+    assert loss(result.y) < 1e-4 * loss(y0)
+
+
+def test_a_round_beyond_the_domain_is_drawn_nearer(x64):
+    """A function that has numbers in a small ball only, and jumps there, is still minimised."""
+
+    def fun(y, _):
+        stairs = jnp.floor(200 * y) / 200
+        return jnp.where(jnp.sum(y**2) < 0.2**2, stairs - jnp.array([0.1, -0.05]), jnp.nan)
+
+    solver = sd.GaussNewton(1.0, nonfinite="drop")
+    result = sd.least_squares(
+        fun, jnp.zeros(2), key=jax.random.key(0), solver=solver, max_evaluations=150
+    )
+    assert float(result.fun) < 0.1 * (0.1**2 + 0.05**2) / 2
+
+
+def test_a_function_without_numbers_is_an_error():
+    solver = sd.GaussNewton(1.0, nonfinite="drop")
+    with pytest.raises(sd.MinimiseError, match="NaN or infinite"):
+        sd.least_squares(
+            lambda y, _: y * jnp.nan,
+            jnp.zeros(2),
+            key=jax.random.key(0),
+            solver=solver,
+            max_evaluations=150,
+        )
