@@ -15,6 +15,7 @@ from smoothdiff._least_squares import LeastSquares
 from smoothdiff._minimise import MinimiseError, Record, Result, least_squares, minimise
 from smoothdiff._newton_step import newton_step
 from smoothdiff._quadratic import HessianOperator, QuadraticModel
+from smoothdiff._ranges import Integer, Range
 from smoothdiff._samplers import AbstractSampler, Gaussian, Noise, Orthogonal, Sobol, Uniform
 from smoothdiff._smooth import smooth, smooth_grad, smooth_jacobian, smooth_value_and_grad
 from smoothdiff._smooth_second import smooth_hessian, smooth_hvp, smooth_quadratic
@@ -23,13 +24,16 @@ from smoothdiff._solvers.gauss_newton import GaussNewton
 from smoothdiff._solvers.local_gauss_newton import LocalGaussNewton
 from smoothdiff._solvers.newton_cg import NewtonCG
 from smoothdiff._solvers.zerograds import ZeroGrads
+from smoothdiff._spaces import AbstractSpace
 from smoothdiff._support import local_support, matrix_support, moving_support, probe_support
+from smoothdiff._unbounded import Periodic, Positive, Real
 
 __version__ = "0.1.0"
 
 __all__ = [
     "AbstractBaseline",
     "AbstractSampler",
+    "AbstractSpace",
     "Aggregate",
     "BlackBoxError",
     "FirstOrder",
@@ -38,6 +42,7 @@ __all__ = [
     "GaussianProcess",
     "HessianOperator",
     "Importance",
+    "Integer",
     "LeastSquares",
     "LocalGaussNewton",
     "MinimiseError",
@@ -45,7 +50,11 @@ __all__ = [
     "Noise",
     "Options",
     "Orthogonal",
+    "Periodic",
+    "Positive",
     "QuadraticModel",
+    "Range",
+    "Real",
     "Record",
     "Result",
     "Sobol",
