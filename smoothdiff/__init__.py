@@ -1,6 +1,6 @@
 """Gradients, Hessians and Hessian-vector products of functions that AD cannot differentiate."""
 
-from smoothdiff import filters, kernels, surrogates
+from smoothdiff import filters, kernels, plot, surrogates
 from smoothdiff._aggregate import Aggregate
 from smoothdiff._baselines import AbstractBaseline
 from smoothdiff._black_box import black_box
@@ -74,6 +74,7 @@ __all__ = [
     "minimise",
     "moving_support",
     "newton_step",
+    "plot",
     "probe_support",
     "scale_by_filtered_adam",
     "smooth",

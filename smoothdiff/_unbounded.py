@@ -183,6 +183,11 @@ class Periodic(AbstractSpace):
         # rounded up, the last value before the end is the first one again
         return jnp.where(y >= low + period, low, y)
 
+    def to_axis(self, u: ArrayLike) -> Array:
+        """Where plots show a unit coordinate: in the period that it is in, not the first one."""
+        u = floating(u)
+        return fit(self.low, u) + fit(self.period, u) * u
+
     def _default_sigma(self) -> float:
         return SIGMA / 2
 
