@@ -14,10 +14,12 @@ from smoothdiff._large_steps import large_steps
 from smoothdiff._least_squares import LeastSquares
 from smoothdiff._minimise import MinimiseError, Record, Result, least_squares, minimise
 from smoothdiff._newton_step import newton_step
+from smoothdiff._noise import Noise
 from smoothdiff._quadratic import HessianOperator, QuadraticModel
 from smoothdiff._ranges import Integer, Range
-from smoothdiff._samplers import AbstractSampler, Gaussian, Noise, Orthogonal, Sobol, Uniform
-from smoothdiff._smooth import smooth, smooth_grad, smooth_jacobian, smooth_value_and_grad
+from smoothdiff._samplers import AbstractSampler, Gaussian, Orthogonal, Sobol, Uniform
+from smoothdiff._smooth import smooth
+from smoothdiff._smooth_first import smooth_grad, smooth_jacobian, smooth_value_and_grad
 from smoothdiff._smooth_second import smooth_hessian, smooth_hvp, smooth_quadratic
 from smoothdiff._solvers.first_order import FirstOrder
 from smoothdiff._solvers.gauss_newton import GaussNewton

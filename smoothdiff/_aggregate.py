@@ -1,7 +1,7 @@
 """The papers' aggregate importance sampler: one set of points for all elements of a derivative."""
 
 import math
-from typing import Literal
+from typing import ClassVar, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -46,6 +46,7 @@ class Aggregate(PointSampler):
     Source: Stochastic Gradient Estimation for Higher-order Differentiable Rendering, section 3.5.
     """
 
+    gaussian: ClassVar[bool] = False
     order: Literal[1, 2] = eqx.field(static=True)
     antithetic: bool = eqx.field(static=True, default=True)
     quasi: bool = eqx.field(static=True, default=False)

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from smoothdiff._draws import Draws
+from smoothdiff._noise import NoiseSampler
 
 
 class Control(eqx.Module):
@@ -61,10 +62,10 @@ class AbstractBaseline(eqx.Module):
 
     def check_gaussian(self, draws: Draws) -> None:
         """Raises ValueError if it is no Gaussian that smooths."""
-        if not draws.sampler.gaussian:
+        if isinstance(draws.sampler, NoiseSampler):
             raise ValueError(
                 f"{self} knows its own smoothed value for Gaussian smoothing only: use "
-                f'baseline="mean" with {draws.sampler}'
+                f'baseline="mean" with noise={draws.sampler.noise!r}'
             )
 
     @abc.abstractmethod

@@ -132,7 +132,10 @@ def _check_support(
     log_ratio: Array | None,
 ) -> None:
     if log_ratio is not None:
-        raise ValueError("support needs points that are normal themselves: Gaussian, Sobol, ...")
+        raise ValueError(
+            "support needs points that are normal themselves: a sampler such as Gaussian or Sobol, "
+            "and no noise"
+        )
     if not baseline.termwise:
         raise ValueError('support goes with baseline="mean", "center" or "none"')
     row = jax.tree.map(lambda v: jax.ShapeDtypeStruct(v.shape[1:], v.dtype), values)

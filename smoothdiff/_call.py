@@ -1,11 +1,9 @@
 """One call of a transform: its options, their checks, and the way to its batch and value."""
 
-import inspect
 import operator
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
-from functools import wraps
-from typing import Any, Literal, Protocol, TypedDict, Unpack, runtime_checkable
+from dataclasses import dataclass
+from typing import Any, Literal, TypedDict
 
 import jax
 import jax.numpy as jnp
@@ -15,19 +13,27 @@ from smoothdiff._baselines import AbstractBaseline
 from smoothdiff._batch import Batch, evaluate
 from smoothdiff._estimate import combine, displacement, objective
 from smoothdiff._named_baselines import as_baseline
+from smoothdiff._noise import Noise, as_sampler
 from smoothdiff._params import Params, as_argnums, as_key, choose, replace, take_apart
-from smoothdiff._samplers import Sobol, as_sampler
+from smoothdiff._samplers import AbstractSampler
 from smoothdiff._support import as_support
 
 
 class Options(TypedDict, total=False):
     """What every transform takes beside the function and sigma, by keyword.
 
+    The defaults, which the signature of each transform shows, are the same for all, so that they
+    agree with AD of `smooth` at the same key: scrambled points and an interpolation of them are the
+    most accurate for gradients, Hessians and products alike wherever `python -m benchmarks
+    variance` looks.
+
     Args:
         argnums: which of the function's arguments to smooth and differentiate, an int or a tuple.
         num_samples: evaluations of the function in one call, all included.
-        sampler: where to sample, a sampler object such as `Gaussian(antithetic=True)`; or a noise
-            object that smooths instead of the Gaussian, see `Noise`.
+        sampler: where to sample, a sampler object such as `Gaussian(antithetic=True)`; by default
+            `Sobol()`.
+        noise: what smooths in place of the Gaussian, an object with `sample` and `log_prob`, see
+            `Noise`. It draws its points itself, so there is no sampler then.
         baseline: what to subtract: "none", "mean" (of the other samples), "center" (f(theta), one
             evaluation), "linear", "quadratic" or "gp" (fitted), "auto" ("gp" where it gains, else
             "mean"), or a baseline object.
@@ -47,7 +53,8 @@ class Options(TypedDict, total=False):
 
     argnums: int | Sequence[int]
     num_samples: int
-    sampler: Any
+    sampler: AbstractSampler | None
+    noise: Noise | None
     baseline: str | AbstractBaseline
     support: Callable[[PyTree], Array] | None
     bounds: tuple[PyTree, PyTree] | None
@@ -57,43 +64,43 @@ class Options(TypedDict, total=False):
     stderr: bool
 
 
-@dataclass(frozen=True)
+@dataclass
 class Call:
     """A function with its options checked, ready to be evaluated for given arguments.
 
-    The defaults are the same for all transforms, so that they agree with AD of `smooth` at the
-    same key: scrambled points and an interpolation of them are the most accurate for gradients,
-    Hessians and products alike wherever `python -m benchmarks variance` looks.
+    The fields are the arguments of a transform, which begins with `call = Call(**locals())`. They
+    may be anything until they are checked.
     """
 
-    fun: Callable
+    fun: Any
     sigma: Any
-    argnums: int | Sequence[int] = 0
-    num_samples: int = 64
-    sampler: Any = Sobol()  # noqa: RUF009 (a frozen module)
-    baseline: str | AbstractBaseline = "auto"
-    support: Callable[[PyTree], Array] | None = None
-    bounds: tuple[PyTree, PyTree] | None = None
-    batch_size: int | None = None
-    nonfinite: Literal["propagate", "drop"] = "propagate"
-    has_aux: bool = False
-    stderr: bool = False
+    argnums: Any
+    num_samples: Any
+    baseline: Any
+    sampler: Any = None
+    noise: Any = None
+    support: Any = None
+    bounds: Any = None
+    batch_size: Any = None
+    nonfinite: Any = "propagate"
+    has_aux: Any = False
+    stderr: Any = False
 
     def __post_init__(self):
         if not callable(self.fun):
             raise TypeError(f"the first argument must be a function, not {type(self.fun).__name__}")
         if self.nonfinite not in ("propagate", "drop"):
             raise ValueError(f'nonfinite must be "propagate" or "drop", not {self.nonfinite!r}')
+        self.num_samples = _positive(self.num_samples, "num_samples")
+        if self.batch_size is not None:
+            self.batch_size = _positive(self.batch_size, "batch_size")
+        as_sampler(self.sampler, self.noise)
         extra = as_baseline(self.baseline).evaluations()
         if self.num_samples <= extra:
             raise ValueError(
                 f"num_samples={self.num_samples} leaves no samples: baseline={self.baseline!r} "
                 f"itself needs {extra}"
             )
-
-    def options(self) -> Options:
-        """The options as a transform takes them."""
-        return {f.name: getattr(self, f.name) for f in fields(self)[2:]}  # pyright: ignore
 
     def params(self, key: Any, args: tuple) -> Params:
         as_key(key)  # first, or else what was passed in place of a key is taken for a parameter
@@ -129,7 +136,7 @@ class Call:
             params,
             as_key(key),
             num_samples=self.num_samples,
-            sampler=as_sampler(self.sampler),
+            sampler=as_sampler(self.sampler, self.noise),
             baseline=as_baseline("mean" if plain else self.baseline),
             batch_size=self.batch_size,
             nonfinite=self.nonfinite,
@@ -162,13 +169,6 @@ class Call:
         return (result, error) if self.stderr else result
 
 
-@runtime_checkable
-class Transform(Protocol):
-    def __call__(
-        self, fun: Callable[..., Any], sigma: PyTree, **options: Unpack[Options]
-    ) -> Callable[..., Any]: ...
-
-
 def _positive(value: Any, name: str) -> int:
     """The value as a Python int, which NumPy's integers are not."""
     try:
@@ -178,38 +178,3 @@ def _positive(value: Any, name: str) -> int:
     if number < 1:
         raise ValueError(f"{name} must be a positive integer, not {value!r}")
     return number
-
-
-def transform(**defaults: Any) -> Callable[[Callable[[Call], Callable]], Transform]:
-    """Gives a transform its options: defaults of its own, checks, and a signature that shows them.
-
-    The decorated function receives a `Call` and returns the function that users call.
-    """
-
-    def decorate(make: Callable[[Call], Callable]) -> Transform:
-        known = {f.name: f.default for f in fields(Call)[2:]} | defaults
-
-        @wraps(make)
-        def with_options(fun: Callable, sigma: PyTree, **options: Unpack[Options]) -> Callable:
-            unknown = sorted(set(options) - set(known))
-            if unknown:
-                raise TypeError(f"{make.__name__} has no option {unknown}; it has {sorted(known)}")
-            chosen: dict[str, Any] = {**known, **options}
-            chosen["num_samples"] = _positive(chosen["num_samples"], "num_samples")
-            if chosen["batch_size"] is not None:
-                chosen["batch_size"] = _positive(chosen["batch_size"], "batch_size")
-            return make(Call(fun, sigma, **chosen))
-
-        hints = Options.__annotations__
-        kind = inspect.Parameter
-        shown = [kind("fun", kind.POSITIONAL_OR_KEYWORD, annotation=Callable)]
-        shown += [kind("sigma", kind.POSITIONAL_OR_KEYWORD, annotation=PyTree)]
-        shown += [
-            kind(name, kind.KEYWORD_ONLY, default=default, annotation=hints[name])
-            for name, default in known.items()
-        ]
-        signature = inspect.Signature(shown, return_annotation=Callable)
-        with_options.__signature__ = signature  # pyright: ignore[reportAttributeAccessIssue]
-        return with_options
-
-    return decorate

@@ -69,7 +69,9 @@ def control_variate(
     def left(*args: Any) -> PyTree:
         return jax.tree.map(jnp.subtract, fun(*args), surrogate(*args))
 
-    of_surrogate = {**options, **_SURROGATE, **(surrogate_options or {})}
+    # noise draws its points itself
+    usual = _SURROGATE if options.get("noise") is None else {**_SURROGATE, "sampler": None}
+    of_surrogate = {**options, **usual, **(surrogate_options or {})}
     parts = transform(left, sigma, **options), transform(surrogate, sigma, **of_surrogate)
 
     def g(key: Any, *args: Any) -> PyTree:

@@ -15,6 +15,20 @@ def _drawn(sampler: AbstractSampler, key: Array, start, count: int, num: int, n:
     return sampler.draw(key, start, count, num, n, dtype)
 
 
+def _check_weights(sampler: AbstractSampler, log_ratio: Array | None) -> None:
+    """Raises where a sampler gives weights to normal points, or none to others."""
+    if sampler.gaussian and log_ratio is not None:
+        raise TypeError(
+            f"{sampler} says that its points are normal, and `draw` returns weights: write "
+            "`gaussian: ClassVar[bool] = False` in the class, or return None for them"
+        )
+    if not sampler.gaussian and log_ratio is None:
+        raise TypeError(
+            f"{sampler} says that its points are not normal, and `draw` returns no weights: return "
+            "the logarithms of normal density over that of the points"
+        )
+
+
 class Draws(eqx.Module):
     """`num` points in n dimensions. Without a chunk size they are drawn once and kept.
 
@@ -47,7 +61,9 @@ class Draws(eqx.Module):
 
     def _draw(self, start, count: int):
         key = jax.random.wrap_key_data(self.key_data, impl=self.impl)
-        return _drawn(self.sampler, key, start, count, self.num, self.n, self.dtype)
+        z, log_ratio = _drawn(self.sampler, key, start, count, self.num, self.n, self.dtype)
+        _check_weights(self.sampler, log_ratio)
+        return z, log_ratio
 
     def _chunks(self, rows: PyTree) -> tuple[Array, PyTree, PyTree]:
         """Starts of the full chunks, their rows stacked, and the rows of the last, shorter one."""

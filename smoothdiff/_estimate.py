@@ -17,8 +17,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from smoothdiff._batch import Batch
+from smoothdiff._noise import NoiseSampler
 from smoothdiff._params import Params
-from smoothdiff._samplers import Noise
 from smoothdiff._support import term_weights
 
 
@@ -44,7 +44,7 @@ def weights(
 
     With a support there is one for each term as well, made of its own parameters only.
     """
-    if isinstance(batch.draws.sampler, Noise):
+    if isinstance(batch.draws.sampler, NoiseSampler):
         log_w = _log_noise(batch.draws.sampler, z, shift, ratio)
     elif batch.support is not None:
         rows = shift if shift.ndim == 2 else shift[None]
@@ -72,7 +72,7 @@ def _log_gaussian(z: Array, shift: Array, ratio: Array | None) -> Array:
     return log_w
 
 
-def _log_noise(noise: Noise, z: Array, shift: Array, ratio: Array | None) -> Array:
+def _log_noise(noise: NoiseSampler, z: Array, shift: Array, ratio: Array | None) -> Array:
     rows = shift if shift.ndim == 2 else shift[None]
     moved = (z if ratio is None else z * ratio[None]) - rows
     log_w = noise.log_prob(moved) - noise.log_prob(z)

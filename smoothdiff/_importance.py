@@ -4,12 +4,13 @@ $$ \partial_i F = \frac1N \sum_k \frac{\partial_i \mathcal{N}(x_k)}{q_i(x_k)} f(
    q_i \propto |\partial_i \mathcal{N}| $$
 
 The proposal of an element is the best for that element alone, so a gradient takes n sets of
-samples and a Hessian n(n+1)/2. They are estimators of their own, no proposals for `smooth`.
+samples and a Hessian n(n+1)/2. They are transforms of their own, no samplers.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from functools import partial
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -18,68 +19,17 @@ import numpy as np
 from jaxtyping import Array, Int, PyTree
 
 from smoothdiff import kernels
+from smoothdiff._baselines import AbstractBaseline
 from smoothdiff._call import Call
 from smoothdiff._estimate import objective
 from smoothdiff._params import as_key
 from smoothdiff._samplers import PointSampler
 
 
-class Importance(eqx.Module):
-    """Elementwise importance sampling, as the `sampler` of `smooth_grad` or `smooth_hessian`.
-
-    `num_samples` is for each element, so the evaluations are n times that for a gradient, of order
-    1, and n(n+1)/2 times for a Hessian, of order 2 (its symmetry is used).
-
-    Args:
-        order: 1 for `smooth_grad`, 2 for `smooth_hessian`.
-        antithetic: mirror every point, as in the paper.
-        quasi: quasi-random points instead of independent ones.
-        blur: "all" smooths over all parameters. "own" smooths each derivative over its own
-            parameters only, which is cheaper to reason about and the derivative of another
-            function for each element (FR22).
-
-    Example:
-        >>> import jax, jax.numpy as jnp, smoothdiff as sd
-        >>> f = lambda x: jnp.floor(jnp.sum(x))
-        >>> g = sd.smooth_grad(f, 1.0, sampler=sd.Importance(1), num_samples=8)
-        >>> g(jax.random.key(0), jnp.zeros(3)).shape  # 24 evaluations
-        (3,)
-
-    Source: Stochastic Gradient Estimation for Higher-order Differentiable Rendering, eq. 17-21 and
-    appendices A, B, D; "own" is Plateau-reduced Differentiable Path Tracing (FR22).
-    """
-
-    order: Literal[1, 2] = eqx.field(static=True)
-    antithetic: bool = eqx.field(static=True, default=True)
-    quasi: bool = eqx.field(static=True, default=False)
-    blur: Literal["all", "own"] = eqx.field(static=True, default="all")
-
-    def __check_init__(self):
-        if self.order not in (1, 2):
-            raise ValueError(f"order must be 1 (gradients) or 2 (Hessians), not {self.order!r}")
-        if self.blur not in ("all", "own"):
-            raise ValueError(f'blur must be "all" or "own", not {self.blur!r}')
-
-    def elements(self, n: int) -> Int[np.ndarray, "elements 2"]:
-        """The elements that are sampled: parameters twice, or pairs i <= j."""
-        if self.order == 1:
-            return np.stack([np.arange(n)] * 2, axis=1)
-        return np.stack(np.triu_indices(n), axis=1)
-
-    def sampler(self, element: Int[Array, "2"]) -> "ElementSampler":
-        """The sampler of one element."""
-        return ElementSampler(
-            element=element,
-            order=self.order,
-            antithetic=self.antithetic,
-            quasi=self.quasi,
-            blur=self.blur,
-        )
-
-
 class ElementSampler(PointSampler):
     """Points for one element (i, j): its positivised kernel there, Gaussian elsewhere."""
 
+    gaussian: ClassVar[bool] = False
     element: Int[Array, "2"]
     order: Literal[1, 2] = eqx.field(static=True)
     antithetic: bool = eqx.field(static=True)
@@ -109,31 +59,93 @@ class ElementSampler(PointSampler):
         return z, jnp.sum(jnp.where(own, log_ratio, 0), axis=1)
 
 
-def elementwise(call: Call, importance: Importance, order: int) -> Callable[..., PyTree]:
-    """The transform `g(key, *args)` that estimates each element from samples of its own."""
-    if importance.order != order:
-        raise ValueError(
-            f"Importance({importance.order}) samples derivatives of order {importance.order}, and "
-            f"this transform is of order {order}: use Importance({order}), or Aggregate"
-        )
-    if call.has_aux or call.stderr or call.support is not None:
-        raise ValueError("Importance takes no has_aux, stderr or support: use another sampler")
+class Importance(eqx.Module):
+    """The gradient or the Hessian of the smoothed function, by elementwise importance sampling.
 
-    def g(key: Any, *args: Any) -> PyTree:
+    A transform, called like `smooth_grad` or `smooth_hessian`. `num_samples` is for each element,
+    so the evaluations are n times that for a gradient, of order 1, and n(n+1)/2 times for a
+    Hessian, of order 2 (its symmetry is used).
+
+    Args:
+        order: 1 for the gradient, 2 for the Hessian.
+        antithetic: mirror every point, as in the paper.
+        quasi: quasi-random points instead of independent ones.
+        blur: "all" smooths over all parameters. "own" smooths each derivative over its own
+            parameters only, which is cheaper to reason about and the derivative of another
+            function for each element (FR22).
+
+    Example:
+        >>> import jax, jax.numpy as jnp, smoothdiff as sd
+        >>> f = lambda x: jnp.floor(jnp.sum(x))
+        >>> g = sd.Importance(1)(f, 1.0, num_samples=8)
+        >>> g(jax.random.key(0), jnp.zeros(3)).shape  # 24 evaluations
+        (3,)
+
+    Source: Stochastic Gradient Estimation for Higher-order Differentiable Rendering, eq. 17-21 and
+    appendices A, B, D; "own" is Plateau-reduced Differentiable Path Tracing (FR22).
+    """
+
+    order: Literal[1, 2] = eqx.field(static=True)
+    antithetic: bool = eqx.field(static=True, default=True)
+    quasi: bool = eqx.field(static=True, default=False)
+    blur: Literal["all", "own"] = eqx.field(static=True, default="all")
+
+    def __check_init__(self):
+        if self.order not in (1, 2):
+            raise ValueError(f"order must be 1 (gradients) or 2 (Hessians), not {self.order!r}")
+        if self.blur not in ("all", "own"):
+            raise ValueError(f'blur must be "all" or "own", not {self.blur!r}')
+
+    def __call__(
+        self,
+        fun: Callable[..., Any],
+        sigma: PyTree,
+        *,
+        argnums: int | Sequence[int] = 0,
+        num_samples: int = 64,
+        baseline: str | AbstractBaseline = "auto",
+        bounds: tuple[PyTree, PyTree] | None = None,
+        batch_size: int | None = None,
+        nonfinite: Literal["propagate", "drop"] = "propagate",
+    ) -> Callable[..., PyTree]:
+        """`g(key, *args)`: the derivative, as `smooth_grad` or `smooth_hessian` returns it.
+
+        Args:
+            fun: a function with a scalar output.
+            sigma: as for `smooth`, but a positive width for every leaf.
+            argnums, ..., nonfinite: see `Options`; `num_samples` is for each element.
+
+        Raises:
+            ValueError, TypeError: as `smooth`; an output that is no scalar; a sigma of None.
+        """
+        call = Call(
+            fun,
+            sigma,
+            argnums,
+            num_samples,
+            baseline,
+            bounds=bounds,
+            batch_size=batch_size,
+            nonfinite=nonfinite,
+        )
+        return partial(self._derivative, call)
+
+    def _derivative(self, call: Call, key: Any, *args: Any) -> PyTree:
         params = call.params(key, args)
         call.only_smoothed(params, "Importance")
         n, tree = params.theta.size, params.layout.tree
+        order, sampler = self.order, partial(ElementSampler, **vars(self))
 
         def element(inputs: tuple[Array, Array]) -> Array:
             pair, k = inputs
-            own = replace(call, sampler=importance.sampler(pair))
-            batch = own.batch(k, args, params, scalar=True)
+            batch = replace(call, sampler=sampler(element=pair)).batch(k, args, params, scalar=True)
             along = lambda i: (jnp.arange(n) == i).astype(params.theta.dtype)
             zero = jnp.zeros_like(params.theta)
             first = lambda d: jax.jvp(lambda s: objective(batch, s), (d,), (along(pair[0]),))[1]
             return first(zero) if order == 1 else jax.jvp(first, (zero,), (along(pair[1]),))[1]
 
-        pairs = importance.elements(n)
+        # the elements that are sampled: parameters twice, or pairs i <= j
+        pairs = np.stack([np.arange(n)] * 2 if order == 1 else np.triu_indices(n), axis=1)
         keys = jax.vmap(lambda e: jax.random.fold_in(as_key(key), e))(jnp.arange(len(pairs)))
         out = jax.lax.map(element, (jnp.asarray(pairs), keys)).astype(params.theta.dtype)
         if order == 1:
@@ -142,8 +154,6 @@ def elementwise(call: Call, importance: Importance, order: int) -> Callable[...,
         out = out / (params.sigma[i] * params.sigma[j])
         matrix = jnp.zeros((n, n), out.dtype).at[i, j].set(out).at[j, i].set(out)
         return jax.tree.map(lambda column: tree(jnp.moveaxis(column, 0, -1)), tree(matrix))
-
-    return g
 
 
 def difference_hvp(

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from smoothdiff._baselines import AbstractBaseline, Center, Mean, NoBaseline
 from smoothdiff._gp import GaussianProcess
 from smoothdiff._least_squares import LeastSquares
+from smoothdiff._noise import NoiseSampler
 
 # Beyond, the regression's N^3 operations are worth more samples than the error that they save
 _MOST_SAMPLES = 1024
@@ -19,7 +20,8 @@ class Auto(AbstractBaseline):
     """
 
     def __call__(self, values, draws, log_ratio, valid, center):
-        gains = draws.sampler.gaussian and draws.n <= draws.num <= _MOST_SAMPLES
+        gaussian = not isinstance(draws.sampler, NoiseSampler)
+        gains = gaussian and draws.n <= draws.num <= _MOST_SAMPLES
         return (GaussianProcess() if gains else Mean())(values, draws, log_ratio, valid, center)
 
 

@@ -2,7 +2,7 @@
 
 import abc
 import math
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -17,10 +17,20 @@ class AbstractSampler(eqx.Module):
 
     Points are addressed by row, so that any part of a set can be drawn again without the rest:
     chunks, repeated passes and stored models need no other state than the key.
+
+    Every sampler says in `gaussian` whether its points are standard normal as they are drawn. If
+    not, `draw` returns their weights, and if so it returns None for them.
     """
 
-    # what smooths is a Gaussian; `Noise` is the exception
-    gaussian: ClassVar[bool] = True
+    gaussian: ClassVar[bool]
+
+    def __check_init__(self):
+        if not isinstance(getattr(self, "gaussian", None), bool):
+            raise TypeError(
+                f"{type(self).__name__} does not say whether its points are standard normal: write "
+                "`gaussian: ClassVar[bool] = True` in the class, or False if `draw` returns the "
+                "logarithms of normal density over that of the points"
+            )
 
     @property
     def balanced(self) -> bool:
@@ -43,7 +53,7 @@ class AbstractSampler(eqx.Module):
 
         Returns:
             The points, and the logarithms of normal density over proposal density; None for the
-            latter if the points are normal. `start` and `count` are multiples of the block. Traced
+            latter if `gaussian`. `start` and `count` are multiples of the block. Traced
             by JAX, always: no value can be looked at.
         """
 
@@ -134,6 +144,7 @@ class Gaussian(PointSampler):
     (every sampler of the paper is antithetic).
     """
 
+    gaussian: ClassVar[bool] = True
     antithetic: bool = eqx.field(static=True, default=False)
 
     def mirrored(self) -> bool:
@@ -174,6 +185,7 @@ class Sobol(PointSampler):
     papers use independent points.
     """
 
+    gaussian: ClassVar[bool] = True
     antithetic: bool = eqx.field(static=True, default=False)
     replicates: int = eqx.field(static=True, default=1)
 
@@ -214,6 +226,7 @@ class Orthogonal(AbstractSampler):
     policy optimization (2018).
     """
 
+    gaussian: ClassVar[bool] = True
     antithetic: bool = eqx.field(static=True, default=True)
 
     def block(self, num_samples: int, n: int) -> int:
@@ -265,6 +278,7 @@ class Uniform(PointSampler):
     Source: Stochastic Gradient Estimation for Higher-order Differentiable Rendering, appendix J.
     """
 
+    gaussian: ClassVar[bool] = False
     half_width: float = eqx.field(static=True, default=3.0)
     antithetic: bool = eqx.field(static=True, default=False)
     quasi: bool = eqx.field(static=True, default=False)
@@ -279,55 +293,3 @@ class Uniform(PointSampler):
         z = self.half_width * (2 * u - 1)
         constant = n * math.log(2 * self.half_width / math.sqrt(2 * math.pi))
         return z, constant - jnp.sum(z * z, axis=1) / 2
-
-
-class Noise(AbstractSampler):
-    r"""Another distribution as the smoothing kernel itself, in place of the Gaussian.
-
-    $$ F(\theta) = \mathbb{E}_{z \sim p}[f(\theta + \sigma z)], \qquad
-       \log w = \log p\big(\tfrac{x - \theta}{\sigma}\big) - \log p(z) $$
-
-    A `noise` object given as `sampler` to a transform is wrapped in this by itself. Derivatives
-    are as good as `log_prob` is smooth.
-
-    Args:
-        noise: has `sample(key, sample_shape, dtype)` and an elementwise, differentiable
-            `log_prob(z)`, like the distributions of `optax.perturbations`.
-
-    Example:
-        >>> import jax, jax.numpy as jnp, optax, smoothdiff as sd
-        >>> gumbel = optax.perturbations.Gumbel()
-        >>> one_hot = lambda x: (x == jnp.max(x)).astype(float)
-        >>> soft = sd.smooth(one_hot, 1.0, sampler=gumbel, num_samples=4096)
-        >>> print(soft(jax.random.key(0), jnp.zeros(2)).round(1))  # a softmax
-        [0.5 0.5]
-
-    Source: Q. Berthet et al., Learning with differentiable perturbed optimizers (2020).
-    """
-
-    noise: Any = eqx.field(static=True)
-    gaussian: ClassVar[bool] = False
-
-    def block(self, num_samples: int, n: int) -> int:
-        return 1
-
-    def draw(self, key, start, count, num_samples, n, dtype):
-        keys = jax.vmap(lambda row: jax.random.fold_in(key, row))(start + jnp.arange(count))
-        return jax.vmap(lambda k: self.noise.sample(k, (n,), dtype))(keys), None
-
-    def log_prob(self, z: Float[Array, "... n"]) -> Float[Array, "..."]:
-        """The logarithm of the density, up to a constant."""
-        return jnp.sum(self.noise.log_prob(z), axis=-1)
-
-
-def as_sampler(sampler: Any) -> AbstractSampler:
-    """The sampler itself, or a noise object as a sampler."""
-    if isinstance(sampler, AbstractSampler):
-        return sampler
-    if hasattr(sampler, "sample") and hasattr(sampler, "log_prob"):
-        return Noise(sampler)
-    raise TypeError(
-        "sampler must be a sampler object such as Gaussian() or Sobol(), or a noise object with "
-        f"sample and log_prob, not {sampler!r} (Importance is for smooth_grad and smooth_hessian "
-        "only; Aggregate is for all transforms)"
-    )

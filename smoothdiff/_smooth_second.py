@@ -1,22 +1,38 @@
 """The public transforms of second order: Hessian, its products, and the quadratic model."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from smoothdiff._call import Call, transform
+from smoothdiff._baselines import AbstractBaseline
+from smoothdiff._call import Call
 from smoothdiff._estimate import displacement, objective
-from smoothdiff._importance import Importance, elementwise
+from smoothdiff._noise import Noise
 from smoothdiff._params import choose, replace
 from smoothdiff._quadratic import HessianOperator, QuadraticModel
+from smoothdiff._samplers import AbstractSampler
 
 
-@transform()
-def smooth_hessian(call: Call) -> Callable:
+def smooth_hessian(
+    fun: Callable[..., Any],
+    sigma: PyTree,
+    *,
+    argnums: int | Sequence[int] = 0,
+    num_samples: int = 64,
+    sampler: AbstractSampler | None = None,
+    noise: Noise | None = None,
+    baseline: str | AbstractBaseline = "auto",
+    support: Callable[[PyTree], Array] | None = None,
+    bounds: tuple[PyTree, PyTree] | None = None,
+    batch_size: int | None = None,
+    nonfinite: Literal["propagate", "drop"] = "propagate",
+    has_aux: bool = False,
+    stderr: bool = False,
+) -> Callable[..., Any]:
     r"""The Hessian of the smoothed function, like `jax.hessian`.
 
     $$ \nabla^2 F(\theta)
@@ -25,7 +41,7 @@ def smooth_hessian(call: Call) -> Callable:
     Args:
         fun: a function with a scalar output.
         sigma: as for `smooth`.
-        **options: see `Options`.
+        argnums, ..., stderr: see `Options`.
 
     Returns:
         `g(key, *args)`: the Hessian in the nested structure of `jax.hessian`; with `has_aux` and
@@ -43,9 +59,7 @@ def smooth_hessian(call: Call) -> Callable:
 
     Source: Stochastic Gradient Estimation for Higher-order Differentiable Rendering, eq. 20.
     """
-
-    if isinstance(call.sampler, Importance):
-        return elementwise(call, call.sampler, order=2)
+    call = Call(**locals())
 
     def g(key: Any, *args: Any) -> PyTree:
         params = call.params(key, args)
@@ -74,8 +88,22 @@ def smooth_hessian(call: Call) -> Callable:
     return g
 
 
-@transform()
-def smooth_hvp(call: Call) -> Callable:
+def smooth_hvp(
+    fun: Callable[..., Any],
+    sigma: PyTree,
+    *,
+    argnums: int | Sequence[int] = 0,
+    num_samples: int = 64,
+    sampler: AbstractSampler | None = None,
+    noise: Noise | None = None,
+    baseline: str | AbstractBaseline = "auto",
+    support: Callable[[PyTree], Array] | None = None,
+    bounds: tuple[PyTree, PyTree] | None = None,
+    batch_size: int | None = None,
+    nonfinite: Literal["propagate", "drop"] = "propagate",
+    has_aux: bool = False,
+    stderr: bool = False,
+) -> Callable[..., Any]:
     r"""The product of the smoothed function's Hessian with a vector, without the Hessian.
 
     $$ \nabla^2 F(\theta) \, v
@@ -87,7 +115,7 @@ def smooth_hvp(call: Call) -> Callable:
     Args:
         fun: a function with a scalar output.
         sigma: as for `smooth`.
-        **options: see `Options`; `argnums` counts the arguments of `fun`.
+        argnums, ..., stderr: see `Options`; `argnums` counts the arguments of `fun`.
 
     Returns:
         `g(key, x, v, *other_args)` with `x, *other_args` the arguments of `fun` and `v` a vector
@@ -107,6 +135,7 @@ def smooth_hvp(call: Call) -> Callable:
 
     Source: Stochastic Gradient Estimation for Higher-order Differentiable Rendering, eq. 22.
     """
+    call = Call(**locals())
 
     def g(key: Any, x: PyTree, v: PyTree, *other_args: Any) -> PyTree:
         args = (x, *other_args)
@@ -129,8 +158,22 @@ def smooth_hvp(call: Call) -> Callable:
     return g
 
 
-@transform()
-def smooth_quadratic(call: Call) -> Callable:
+def smooth_quadratic(
+    fun: Callable[..., Any],
+    sigma: PyTree,
+    *,
+    argnums: int | Sequence[int] = 0,
+    num_samples: int = 64,
+    sampler: AbstractSampler | None = None,
+    noise: Noise | None = None,
+    baseline: str | AbstractBaseline = "auto",
+    support: Callable[[PyTree], Array] | None = None,
+    bounds: tuple[PyTree, PyTree] | None = None,
+    batch_size: int | None = None,
+    nonfinite: Literal["propagate", "drop"] = "propagate",
+    has_aux: bool = False,
+    stderr: bool = False,
+) -> Callable[..., Any]:
     r"""Value, gradient and Hessian operator of the smoothed function from one batch.
 
     $$ F(\theta + p) \approx F(\theta) + \nabla F \cdot p + \tfrac12 p \cdot \nabla^2 F \, p $$
@@ -138,7 +181,7 @@ def smooth_quadratic(call: Call) -> Callable:
     Args:
         fun: a function with a scalar output.
         sigma: as for `smooth`, but a positive width for every leaf.
-        **options: see `Options`.
+        argnums, ..., stderr: see `Options`.
 
     Returns:
         `g(key, x, *other_args)`: a `QuadraticModel`; with `has_aux` the pair of it and aux.
@@ -157,6 +200,7 @@ def smooth_quadratic(call: Call) -> Callable:
 
     Source: Stochastic Gradient Estimation for Higher-order Differentiable Rendering, eq. 17-22.
     """
+    call = Call(**locals())
     if call.stderr:
         raise ValueError("smooth_quadratic needs no stderr=True: use model.stderr, hessian_stderr")
 

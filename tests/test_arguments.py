@@ -6,7 +6,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from closed_forms import PLAIN, assert_same, assert_unbiased, boxes, keys, smoothed_step, step
+from closed_forms import (
+    PLAIN,
+    as_users_have_it,
+    assert_same,
+    assert_unbiased,
+    boxes,
+    keys,
+    smoothed_step,
+    step,
+)
 
 import smoothdiff as sd
 
@@ -234,7 +243,8 @@ def test_sigma_broadcasts_to_its_leaf(key):
 
 def test_counts_may_be_integers_of_numpy(key):
     x = jnp.array([0.1, 0.2])
-    g = lambda num, size: sd.smooth_grad(boxes, 0.5, num_samples=num, batch_size=size, **PLAIN)
+    make = as_users_have_it(sd.smooth_grad)
+    g = lambda num, size: make(boxes, 0.5, num_samples=num, batch_size=size, **PLAIN)
     np.testing.assert_array_equal(g(np.int64(16), np.int32(8))(key, x), g(16, 8)(key, x))
     for bad in (np.int64(0), 16.0, np.float64(16), "16", None):
         with pytest.raises(ValueError, match="num_samples must be a positive integer"):

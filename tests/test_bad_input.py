@@ -6,8 +6,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
-from closed_forms import PLAIN, boxes
+from closed_forms import PLAIN, as_users_have_it, boxes
 
 import smoothdiff as sd
 
@@ -26,13 +27,14 @@ SCALAR = (
 def grad(
     sigma: Any = 0.5, x: Any = X, fun: Any = boxes, key: Any = KEY, **options: Any
 ) -> Callable[[], Any]:
-    return lambda: sd.smooth_grad(fun, sigma, **options)(key, x)
+    return lambda: as_users_have_it(sd.smooth_grad)(fun, sigma, **options)(key, x)
 
 
 def tree_fun(p):
     return boxes(p["a"]) * p["b"]
 
 
+GUMBEL = optax.perturbations.Gumbel()
 PAIRS = sd.Gaussian(antithetic=True)
 NONE = {"a": 0.5, "b": None}
 
@@ -106,7 +108,7 @@ KEYS = {
 SAMPLES = {
     "zero": (grad(num_samples=0), ValueError, "positive integer"),
     "negative": (grad(num_samples=-4), ValueError, "positive integer"),
-    "no integer": (grad(num_samples=4.0), (TypeError, ValueError), "num_samples"),
+    "no integer": (grad(num_samples=4.0), ValueError, "num_samples must be a positive integer"),
     "one of a pair": (grad(num_samples=1, sampler=PAIRS), ValueError, "multiple of 2"),
     "odd pairs": (grad(num_samples=7, sampler=PAIRS), ValueError, "multiple of 2.*7"),
     "only the center": (grad(num_samples=1, baseline="center"), ValueError, "num_samples"),
@@ -117,7 +119,7 @@ SAMPLES = {
         "multiple of 2.*1 of num_samples=64 is for the baseline",
     ),
     "batch_size of zero": (grad(batch_size=0), ValueError, "batch_size must be a positive"),
-    "batch_size no integer": (grad(batch_size=0.5), (TypeError, ValueError), "batch_size"),
+    "batch_size no integer": (grad(batch_size=0.5), ValueError, "batch_size must be a positive"),
 }
 BOUNDS = {
     "low above high": (grad(bounds=(1.0, -1.0)), ValueError, r"above high.*give \(low, high\)"),
@@ -139,13 +141,22 @@ BOUNDS = {
     "another shape": (grad(bounds=(jnp.zeros(3), 1.0)), ValueError, "bounds.*broadcast"),
 }
 CHOICES = {
-    "function": (grad(fun=3.0), TypeError, "function|fun"),
+    "function": (grad(fun=3.0), TypeError, "must be a function, not float"),
     "baseline": (grad(baseline="median"), ValueError, "'center'.*'mean'.*'none'.*'median'"),
     "baseline object": (grad(baseline=3), (TypeError, ValueError), "baseline"),
-    "sampler": (grad(sampler="gaussian"), TypeError, "sampler"),
-    "sampler class": (grad(sampler=sd.Gaussian), TypeError, "sampler"),
-    "nonfinite": (grad(nonfinite="ignore"), (TypeError, ValueError), "propagate.*drop"),
-    "option": (grad(samples=3), TypeError, "samples.*num_samples"),
+    "sampler": (grad(sampler="gaussian"), TypeError, r"sampler object such as Gaussian\(\)"),
+    "sampler class": (grad(sampler=sd.Gaussian), TypeError, "an instance of AbstractSampler"),
+    "estimator": (grad(sampler=sd.Importance(1)), TypeError, r"write Importance\(1\)\(fun, sigma"),
+    "noise as a sampler": (
+        grad(sampler=GUMBEL),
+        TypeError,
+        r"write noise=\.\.\.",
+    ),
+    "sampler as noise": (grad(noise=sd.Sobol()), TypeError, r"sample and log_prob.*sampler=\.\.\."),
+    "noise class": (grad(noise=optax.perturbations.Gumbel), TypeError, "sample and log_prob"),
+    "noise and sampler": (grad(noise=GUMBEL, sampler=PAIRS), ValueError, "leave out the sampler"),
+    "nonfinite": (grad(nonfinite="ignore"), ValueError, "propagate.*drop"),
+    "option": (grad(samples=3), TypeError, "unexpected keyword argument 'samples'"),
 }
 OUTPUTS = {
     "integer": (grad(fun=lambda x: 1), TypeError, r"int32.*astype\(float\)"),

@@ -174,6 +174,15 @@ def test_pytrees_other_arguments_and_errors():
     np.testing.assert_allclose(grad["b"], [4.0, 4.0], atol=4 * float(np.max(error["b"])))
 
 
+def test_both_parts_are_smoothed_by_the_same_noise():
+    """Of a surrogate that is the function itself nothing is left but its own part."""
+    fun, gumbel = lambda x: jnp.sum(jnp.maximum(x, 0)), optax.perturbations.Gumbel()
+    g = sd.control_variate(sd.smooth, fun, fun, 0.5, noise=gumbel, num_samples=2)
+    found = jax.jit(g)(KEY, jnp.ones(1))
+    # far from the kink: E[1 + z / 2] with the mean of a Gumbel distribution, not of a normal one
+    np.testing.assert_allclose(found, 1 + 0.5 * np.euler_gamma, atol=0.04)
+
+
 def test_it_can_be_differentiated_like_the_transform():
     of = lambda transform: sd.control_variate(
         transform, CASE.fun, near, 0.5, surrogate_options=QUICK

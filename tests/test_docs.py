@@ -44,8 +44,20 @@ def test_transforms_say_all_there_is_to_say(name):
         if parameter in ("fun", "sigma"):
             assert f"{parameter}: " in doc
         else:
-            # the options are the same for all transforms, and described once
+            # the others are the same for all transforms, and described once
             assert f"{parameter}: " in (inspect.getdoc(sd.Options) or ""), parameter
+
+
+@pytest.mark.parametrize("name", TRANSFORMS)
+def test_transforms_show_their_arguments_in_their_own_source(name):
+    """Which is where an editor looks; all transforms have the same, with the same defaults."""
+    function = inspect.unwrap(getattr(sd, name))
+    shown = inspect.signature(function).parameters
+    assert list(shown) == ["fun", "sigma", *sd.Options.__annotations__]
+    assert function.__code__.co_varnames[: len(shown)] == tuple(shown)
+    assert [p.default for p in shown.values()] == [
+        p.default for p in inspect.signature(sd.smooth).parameters.values()
+    ]
 
 
 @pytest.mark.parametrize(

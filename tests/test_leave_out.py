@@ -1,6 +1,6 @@
 """Fits that leave out what depends on a sample: refits by brute force, and standard errors."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,8 @@ PAIRS = sd.Gaussian(antithetic=True)
 
 class Threes(sd.AbstractSampler):
     """Normal points of which three at a time are left out together; the last may be fewer."""
+
+    gaussian: ClassVar[bool] = True
 
     def block(self, num_samples, n):
         return 1

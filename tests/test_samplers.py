@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from closed_forms import assert_unbiased, boxes, half_space, keys
 from scipy import integrate, stats
 
 import smoothdiff as sd
-from smoothdiff._samplers import as_sampler
+from smoothdiff._noise import as_sampler
 
 KEY = jax.random.key(0)
 GUMBEL = optax.perturbations.Gumbel()
@@ -39,7 +39,7 @@ WEIGHTED = {
     "uniform": (sd.Uniform(), 7),
     "uniform, quasi pairs": (sd.Uniform(antithetic=True, quasi=True), 8),
 }
-ALL = {**NORMAL, **WEIGHTED, "noise": (as_sampler(GUMBEL), 7)}
+ALL = {**NORMAL, **WEIGHTED, "noise": (as_sampler(None, GUMBEL), 7)}
 # every sampler, alone and in pairs, independent and scrambled
 ADDRESSED = ("gaussian", "pairs", "sobol pairs", "sobol replicates", "frames", "frames of pairs")
 ADDRESSED += ("aggregate 1", "aggregate, quasi", "uniform", "uniform, quasi pairs", "noise")
@@ -375,18 +375,18 @@ def test_evaluations_are_those_of_table_1(n):
     num, x = 8, jnp.zeros(n)
     by_element = {1: n * num, 2: n * (n + 1) // 2 * num}
     cases = [
-        (sd.smooth_grad, sd.Aggregate(1), num),
-        (sd.smooth_grad, sd.Importance(1), by_element[1]),
-        (sd.smooth_hessian, sd.Gaussian(), num),
-        (sd.smooth_hessian, sd.Aggregate(2), num),
-        (sd.smooth_hessian, sd.Importance(2), by_element[2]),
-        (sd.smooth_hvp, sd.Aggregate(2), num),
+        (sd.smooth_grad, {"sampler": sd.Aggregate(1)}, num),
+        (sd.Importance(1), {}, by_element[1]),
+        (sd.smooth_hessian, {"sampler": sd.Gaussian()}, num),
+        (sd.smooth_hessian, {"sampler": sd.Aggregate(2)}, num),
+        (sd.Importance(2), {}, by_element[2]),
+        (sd.smooth_hvp, {"sampler": sd.Aggregate(2)}, num),
     ]
     counts: list[list[int]] = [[] for _ in cases]
 
     def estimate(case, count):
-        transform, sampler, _ = case
-        g = transform(counted(count), 0.5, sampler=sampler, num_samples=num, baseline="mean")
+        transform, options, _ = case
+        g = transform(counted(count), 0.5, **options, num_samples=num, baseline="mean")
         return g(KEY, x, x) if transform is sd.smooth_hvp else g(KEY, x)
 
     run = jax.jit(lambda: list(map(estimate, cases, counts)))
@@ -406,7 +406,7 @@ def test_noise_smooths_as_in_optax(noise, baseline):
     """The same value and Jacobian in expectation as `make_perturbed_fun`."""
     one_hot = lambda x: jax.nn.one_hot(jnp.argmax(x), 3, dtype=x.dtype)
     x, sigma = jnp.array([0.3, -0.2, 0.5]), 0.8
-    ours = sd.smooth(one_hot, sigma, sampler=noise, num_samples=64, baseline=baseline)
+    ours = sd.smooth(one_hot, sigma, noise=noise, num_samples=64, baseline=baseline)
     theirs = optax.perturbations.make_perturbed_fun(one_hot, 64, sigma, noise)
     both = []
     for g in (ours, theirs):
@@ -428,7 +428,7 @@ def test_noise_has_second_derivatives_and_those_in_sigma():
     fun = lambda x: (x[0] > x[1]).astype(x.dtype)
 
     def estimate(key):
-        F = lambda x, sigma: sd.smooth(fun, sigma, sampler=GUMBEL, num_samples=64)(key, x)
+        F = lambda x, sigma: sd.smooth(fun, sigma, noise=GUMBEL, num_samples=64)(key, x)
         return jax.hessian(F)(x, 0.8), jax.grad(F, argnums=1)(x, 0.8)
 
     exact = lambda x, sigma: jax.nn.sigmoid((x[0] - x[1]) / sigma)
@@ -438,8 +438,15 @@ def test_noise_has_second_derivatives_and_those_in_sigma():
 
 @pytest.mark.parametrize("baseline", ["linear", "quadratic", "gp"])
 def test_fits_do_not_know_other_noise(baseline):
-    g = sd.smooth_grad(half_space, 0.5, sampler=GUMBEL, baseline=baseline, num_samples=64)
+    g = sd.smooth_grad(half_space, 0.5, noise=GUMBEL, baseline=baseline, num_samples=64)
     with pytest.raises(ValueError, match='baseline="mean"'):
+        g(KEY, jnp.zeros(2))
+
+
+def test_noise_takes_no_support():
+    """A support needs the weight of each parameter by itself."""
+    g = sd.smooth_grad(lambda x: x, 0.5, noise=GUMBEL, support=sd.local_support(0), num_samples=4)
+    with pytest.raises(ValueError, match="no noise"):
         g(KEY, jnp.zeros(2))
 
 
@@ -470,5 +477,44 @@ def test_samplers_that_cannot_be():
         sd.Aggregate(1, share=1.5)
     with pytest.raises((ValueError, TypeError)):
         sd.Aggregate(3)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(TypeError, match="Importance is for smooth_grad and smooth_hessian"):
-        sd.smooth(half_space, 0.5, sampler=sd.Importance(1))(KEY, jnp.zeros(2))
+    with pytest.raises((ValueError, TypeError)):
+        sd.Importance(3)  # pyright: ignore[reportArgumentType]
+
+
+class Wide(sd.AbstractSampler):
+    """Points that are twice as wide as normal ones, and that forget to say so."""
+
+    weighted: bool = False
+
+    def block(self, num_samples, n):
+        return 1
+
+    def draw(self, key, start, count, num_samples, n, dtype):
+        z, _ = sd.Gaussian().draw(key, start, count, num_samples, n, dtype)
+        return 2 * z, jnp.zeros(count, dtype) if self.weighted else None
+
+
+class SaysNormal(Wide):
+    gaussian: ClassVar[bool] = True
+
+
+class SaysWeighted(Wide):
+    gaussian: ClassVar[bool] = False
+
+
+def test_a_sampler_must_say_whether_its_points_are_normal():
+    with pytest.raises(TypeError, match=r"Wide does not say.*gaussian: ClassVar\[bool\] = True"):
+        Wide()
+
+
+@pytest.mark.parametrize(
+    ("sampler", "message"),
+    [
+        (SaysNormal(weighted=True), r"draw` returns weights: write.*gaussian.*= False"),
+        (SaysWeighted(), "draw` returns no weights: return the logarithms"),
+    ],
+)
+def test_what_a_sampler_says_and_draws_must_agree(sampler, message):
+    g = sd.smooth_grad(half_space, 0.5, sampler=sampler, num_samples=4)
+    with pytest.raises(TypeError, match=message):
+        g(KEY, jnp.zeros(2))

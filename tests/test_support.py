@@ -354,7 +354,6 @@ BAD = {
     "other terms": (grad(lambda x: terms(x)[:3]), ValueError, r"shape \(6,\).*\(3,\)"),
     "two arrays": (grad(lambda x: (terms(x), terms(x))), ValueError, "one array of terms"),
     "weighted points": (grad(sampler=sd.Aggregate(1)), ValueError, "normal themselves"),
-    "importance": (grad(sampler=sd.Importance(1)), ValueError, "support"),
     "no function": (grad(support=np.eye(N)), TypeError, "support"),
     "parameters with fewer axes": (grad(support=sd.local_support(1)), ValueError, "2 axes"),
 }

@@ -50,9 +50,9 @@ def prepare(problem: Problem, estimate: Estimate, cost: Cost) -> Solve:
     return flat.iterate(step, optim.init)
 
 
-def _smoothed(**options: Any) -> Estimate:
+def _smoothed(smooth_grad: Callable[..., Any] = sd.smooth_grad, **options: Any) -> Estimate:
     def estimate(black, sigma, key, x, case):
-        return sd.smooth_grad(black, sigma, **options)(key, x, case)
+        return smooth_grad(black, sigma, **options)(key, x, case)
 
     return estimate
 
@@ -73,7 +73,7 @@ def _entry(estimator: str, estimate: Estimate, cost: Cost) -> MethodEntry:
 
 
 FR22 = _smoothed(num_samples=2, baseline="none", sampler=sd.Gaussian(antithetic=True))
-OUR_GRADIENT = _smoothed(num_samples=2, baseline="none", sampler=sd.Importance(1))
+OUR_GRADIENT = _smoothed(sd.Importance(1), num_samples=2, baseline="none")
 AGGREGATE = _smoothed(num_samples=2, baseline="none", sampler=sd.Aggregate(1, share=0.0))
 METHODS = {
     "grey_differences": _entry("finite differences", _differences, lambda n: 2 * n),

@@ -48,8 +48,8 @@ def our_gradient(problem: Problem) -> Solve:
     """A set of samples for each parameter."""
     flat = Flat(problem)
     evaluations = PER_ELEMENT * flat.size
-    options = {"num_samples": PER_ELEMENT, "sampler": sd.Importance(1), "baseline": "none"}
-    slope = jax.jit(lambda key, sigma, x: sd.smooth_grad(flat.loss, sigma, **options)(key, x))
+    options = {"num_samples": PER_ELEMENT, "baseline": "none"}
+    slope = jax.jit(lambda key, sigma, x: sd.Importance(1)(flat.loss, sigma, **options)(key, x))
     gradient = lambda key, i, x: slope(key, sigma_at(flat, i * evaluations), x)
     return adam(flat, gradient, evaluations)
 

@@ -4,7 +4,6 @@ An estimator is a dataclass whose `repr` says all about it. For a problem it giv
 share their evaluations, the quantities that each estimates, and how many evaluations it makes.
 """
 
-import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
@@ -107,16 +106,16 @@ class Elementwise:
 
     def parts(self, problem: Problem, num: int) -> list[Part]:
         n, found = problem.n, []
-        first = (FIRST, n, _first, sd.smooth_grad)
-        second = (SECOND, n * (n + 1) // 2, _second, sd.smooth_hessian)
+        first = (FIRST, n, _first)
+        second = (SECOND, n * (n + 1) // 2, _second)
         order: Any
-        for order, (quantities, elements, of, smooth) in enumerate((first, second), 1):
+        for order, (quantities, elements, of) in enumerate((first, second), 1):
             each = num // elements // 2 * 2
             if each == 0 or (order == 2 and self.own):
                 continue
-            sampler = sd.Importance(order, not self.quasi, self.quasi, "own" if self.own else "all")
-            options: Any = {"num_samples": each, "baseline": "none", "sampler": sampler}
-            call = of(smooth(problem.fun, problem.sigma, **options))
+            blur = "own" if self.own else "all"
+            smooth = sd.Importance(order, not self.quasi, self.quasi, blur)
+            call = of(smooth(problem.fun, problem.sigma, num_samples=each, baseline="none"))
             found.append(Part(quantities, each * elements, call, self.own))
         return found
 
@@ -158,9 +157,8 @@ def _aggregate(title: str, baseline: str, most: int = 4096, **options: Any) -> B
 
 Estimator: TypeAlias = Batch | Elementwise | Differences | Optax
 OURS, PUBLISHED, FAIRER, PEER = "ours", "aggregate", "aggregate-mean", "optax"
-_DEFAULTS = inspect.signature(sd.smooth_quadratic).parameters
-_DEFAULT = _DEFAULTS["baseline"].default, (_DEFAULTS["sampler"].default,)
 _GAUSSIAN, _ORTHOGONAL, _SOBOL = (sd.Gaussian(),), (sd.Orthogonal(),), (sd.Sobol(),)
+_DEFAULT = "auto", _SOBOL
 _QUASI: Any = {"antithetic": False, "quasi": True, "share": 0.1}
 
 ANYWHERE: dict[str, Estimator] = {
