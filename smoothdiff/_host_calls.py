@@ -16,6 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from smoothdiff._casts import as_promised
+
 _log = logging.getLogger("smoothdiff")
 
 
@@ -184,7 +186,8 @@ class HostFunction:
         try:
             leaves = self.out_tree.flatten_up_to(value)
             for leaf, out in zip(leaves, outs, strict=True):
-                _write(leaf, out[rows], out.shape if i is None else out.shape[1:])
+                shape = out.shape if i is None else out.shape[1:]
+                out[rows] = as_promised(leaf, out.dtype, shape)
         except (TypeError, ValueError) as error:
             # A mistake in the program, not in a sample: never retried, never turned into NaN.
             fault = self._fault(samples, i, f"does not return what `out` promises: {error}")
@@ -229,19 +232,3 @@ def _trace(error: Exception) -> str:
 
 def _rows(i: int | None) -> slice:
     return slice(None) if i is None else slice(i, i + 1)
-
-
-def _write(value: Any, rows: np.ndarray, shape: tuple[int, ...]) -> None:
-    """Writes a returned value into its rows, in their precision.
-
-    As in JAX, a plain Python number takes the type that is asked for; an array must have its kind.
-    """
-    array = np.asarray(value)
-    if array.shape != shape:
-        raise ValueError(f"shape {array.shape} instead of {shape}")
-    weak = isinstance(value, bool | int | float)
-    exact = array.dtype.kind in "biu", rows.dtype.kind in "biu"
-    if not np.can_cast(array.dtype, rows.dtype, "same_kind") or not (weak or exact[0] == exact[1]):
-        raise TypeError(f"dtype {array.dtype} instead of {rows.dtype}")
-    with np.errstate(all="ignore"):  # an overflow to inf is caught as not finite
-        rows[...] = array
