@@ -12,12 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from smoothdiff._host_calls import HostFunction, Samples, wait_for
+from smoothdiff._host_calls import BlackBoxError, HostFunction, Samples, wait_for
+from smoothdiff._outputs import Outputs
+from smoothdiff._params import is_concrete
 
 
 def black_box(
-    fun: Callable[..., Any],
-    out: PyTree,
+    fun: Callable[..., Any] | None = None,
+    out: PyTree = None,
     *,
     batched: bool = False,
     executor: concurrent.futures.Executor | None = None,
@@ -28,6 +30,7 @@ def black_box(
 ) -> Callable[..., Any]:
     """Turns a host function of NumPy arrays, such as a renderer, into a JAX function.
 
+    As a decorator it stands alone, `@sd.black_box`, or with options, `@sd.black_box(batched=True)`.
     The result works under `jax.jit`, `jax.vmap`, `jax.lax.scan`, `jax.lax.while_loop` and so on. It
     has no derivative of its own: smooth it, with `smoothdiff.smooth` or one of its derivatives.
 
@@ -40,6 +43,10 @@ def black_box(
             their leaves read-only NumPy arrays.
         out: What `fun` returns: a `jax.ShapeDtypeStruct`, a pytree of them, or an example. For one
             sample, also when `batched`. 64-bit types are narrowed where JAX has them switched off.
+            Floats are rounded to these types; any other change of a value raises. If left out, the
+            first call finds it, and each first call with arguments of other shapes or types. Such
+            a call must come from outside of JAX's transforms, and is an evaluation as any other:
+            `fun` is called once, and what it returns is the result.
         batched: Whether `fun` takes a whole batch. Every leaf of its arguments then has one leading
             axis, of the same size everywhere, and its results must have it too. The size is 1
             outside `jax.vmap`; nested `jax.vmap` become one axis. If False, each sample is a call.
@@ -62,7 +69,8 @@ def black_box(
             `jax.jit` of your own comes an error of JAX's (JaxRuntimeError or ValueError) with the
             same message. What was turned into NaN is logged to "smoothdiff" at level INFO.
         TypeError: If `fun`, `out` or `executor` is of the wrong type; later, if the function is
-            differentiated or called with a typed key.
+            differentiated or called with a typed key, or if JAX traces it before a call has found
+            `out`.
         ValueError: If the options contradict each other.
 
     Example:
@@ -73,44 +81,111 @@ def black_box(
         >>> f = sd.black_box(stairs, jax.ShapeDtypeStruct((), jnp.float32))
         >>> jax.jit(jax.vmap(f))(jnp.array([[0.5, 1.5], [2.5, 3.5]]))
         Array([1., 5.], dtype=float32)
+
+        As a decorator, where a first call says what comes out:
+
+        >>> @sd.black_box
+        ... def clipped(x):
+        ...     return np.clip(x, 0, 1)
+        >>> x = clipped(jnp.array([-1.0, 0.5]))
+        >>> jax.jit(clipped)(x)
+        Array([0. , 0.5], dtype=float32)
     """
+    if fun is None:
+        return functools.partial(
+            black_box,
+            out=out,
+            batched=batched,
+            executor=executor,
+            on_error=on_error,
+            on_nonfinite=on_nonfinite,
+            retries=retries,
+            timeout=timeout,
+        )
     if not callable(fun):
-        raise TypeError(f"black_box needs a function of NumPy arrays, not {fun!r}")
-    specs, out_tree = jax.tree.flatten(jax.tree.map(_spec, out))
+        raise TypeError(
+            f"black_box needs a function of NumPy arrays, not {fun!r}; what it returns is out=..."
+        )
     name = getattr(fun, "__name__", type(fun).__name__)
-    host = HostFunction(
-        fun, name, out_tree, batched, executor, on_error, on_nonfinite, retries, timeout
-    )
-    _check(host, specs)
+    host = HostFunction(fun, name, batched, executor, on_error, on_nonfinite, retries, timeout)
+    _check(host)
+    promised = None if out is None else _jax_function(host, Outputs.like(out))
+    found: dict[Any, Callable[..., Any]] = {}
+
+    @functools.wraps(fun)
+    def box(*args):
+        args = jax.tree.map(_array, args)
+        leaves, tree = jax.tree.flatten(args)
+        shapes = tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves)
+        call = promised or found.get((tree, shapes))
+        if call is None:
+            if not all(map(is_concrete, leaves)):
+                raise TypeError(_unknown(name, tree.unflatten(shapes)))
+            result, outputs = _first(host, leaves, tree)
+            found[tree, shapes] = _jax_function(host, outputs)
+            return result
+        # Outside of jit the error is ours to raise; while jit traces, neither line does anything.
+        with reraise():
+            return jax.block_until_ready(call(*args))
+
+    return box
+
+
+def _jax_function(host: HostFunction, outputs: Outputs) -> Callable[..., Any]:
+    """The host function, of which it is known what it returns, as a JAX function."""
+    for option in ("on_error", "on_nonfinite"):
+        if getattr(host, option) == "nan" and not outputs.have_nan():
+            raise ValueError(
+                f'{option}="nan" needs every output to be of floats, as integers have no NaN: '
+                f'return floats, or write {option}="raise"'
+            )
 
     @jax.custom_jvp
     def call(*args):
         leaves, tree = jax.tree.flatten(args)
-        shapes = tuple(
-            jax.ShapeDtypeStruct(spec.shape, jax.dtypes.canonicalize_dtype(spec.dtype))
-            for spec in specs
-        )
-        callback = _Callback(host, tree, tuple(leaf.ndim for leaf in leaves), shapes)
+        ndims, shapes = tuple(leaf.ndim for leaf in leaves), outputs.shapes()
+        callback = _Callback(host, tree, ndims, outputs.tree, shapes)
         # Under vmap, however nested, one callback gets the whole batch.
         results = jax.pure_callback(callback, shapes, *leaves, vmap_method="expand_dims")
-        return out_tree.unflatten(results)
+        return outputs.tree.unflatten(results)
 
     # Only a tangent that arrives gets here; where the arguments are stopped, none does.
     @call.defjvp
     def no_derivative(primals, tangents):
         raise TypeError(
-            f"the black box {name!r} has no derivative: smooth the function that calls it, for "
-            "example with sd.smooth(fun, sigma) or sd.smooth_grad(fun, sigma), "
+            f"the black box {host.name!r} has no derivative: smooth the function that calls it, "
+            "for example with sd.smooth(fun, sigma) or sd.smooth_grad(fun, sigma), "
             "or stop the derivative with jax.lax.stop_gradient"
         )
 
-    @functools.wraps(fun)
-    def box(*args):
-        # Outside of jit the error is ours to raise; while jit traces, neither line does anything.
-        with reraise():
-            return jax.block_until_ready(call(*jax.tree.map(_array, args)))
+    return call
 
-    return box
+
+def _first(host: HostFunction, leaves: list[jax.Array], tree: Any) -> tuple[PyTree, Outputs]:
+    """The result of a call of which nothing is known yet, and what it says of the next ones."""
+    samples = Samples(leaves, [leaf.ndim for leaf in leaves], tree)
+    value = host.first(samples)
+    try:
+        outputs = Outputs.like(value)
+        outputs = outputs.of_one() if host.batched else outputs
+    except (TypeError, ValueError) as error:
+        raise BlackBoxError(
+            f"black box {host.name!r}: `out` was left out and cannot be what the first call "
+            f"returned, {value!r}: {error}"
+        ) from error
+    rows = [np.empty((1, *out.shape), out.dtype) for out in outputs.shapes()]
+    host.store(samples, None if host.batched else 0, value, rows, outputs.tree)
+    return outputs.tree.unflatten([jnp.asarray(row[0]) for row in rows]), outputs
+
+
+def _unknown(name: str, args: tuple) -> str:
+    given = ", ".join(str(jax.tree.map(lambda a: f"{a.dtype}{list(a.shape)}", arg)) for arg in args)
+    return (
+        f"it is not known yet what the black box {name!r} returns for ({given}), and while JAX "
+        "traces (jit, vmap, grad, the transforms smooth_...) it cannot be called to find out: call "
+        f"it once before, with arrays of these shapes, or write sd.black_box({name}, "
+        "out=jax.ShapeDtypeStruct((), jnp.float32)) with the shape and dtype of what it returns"
+    )
 
 
 # What has been raised in a callback since each of the `reraise` blocks now open was entered.
@@ -148,6 +223,7 @@ class _Callback:
     host: HostFunction
     tree: Any
     ndims: tuple[int, ...]
+    out_tree: Any
     shapes: tuple[jax.ShapeDtypeStruct, ...]
 
     def __call__(self, *leaves: Any) -> list[np.ndarray]:
@@ -155,7 +231,7 @@ class _Callback:
             wait_for(leaves, self.host.name)
             samples = Samples(leaves, self.ndims, self.tree)
             outs = [np.empty((len(samples), *out.shape), out.dtype) for out in self.shapes]
-            self.host(samples, outs)
+            self.host(samples, outs, self.out_tree)
             return [out.reshape(samples.batch_shape + out.shape[1:]) for out in outs]
         except BaseException as error:
             for raised in list(_open_blocks.values()):
@@ -172,32 +248,11 @@ def _array(leaf: Any) -> jax.Array:
     return array
 
 
-def _spec(leaf: Any) -> jax.ShapeDtypeStruct:
-    """The shape and type of an output, from a ShapeDtypeStruct or an example."""
-    if not isinstance(leaf, jax.ShapeDtypeStruct | jax.Array):
-        leaf = np.asarray(leaf)
-    if not (jnp.issubdtype(leaf.dtype, jnp.number) or leaf.dtype == np.bool_):
-        raise TypeError(
-            "`out` must be a jax.ShapeDtypeStruct, an example array or number, or a pytree of "
-            f"them; one of its leaves is {leaf!r}"
-        )
-    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype)
-
-
-def _check(host: HostFunction, specs: list[jax.ShapeDtypeStruct]) -> None:
-    if not specs:
-        raise TypeError(
-            "`out` has no arrays in it; for a number write jax.ShapeDtypeStruct((), jnp.float32)"
-        )
+def _check(host: HostFunction) -> None:
     for option in ("on_error", "on_nonfinite"):
         value = getattr(host, option)
         if value not in ("raise", "nan"):
             raise ValueError(f'{option} must be "raise" or "nan", not {value!r}')
-        if value == "nan" and not all(jnp.issubdtype(spec.dtype, jnp.inexact) for spec in specs):
-            raise ValueError(
-                f'{option}="nan" needs every output to be of floats, as integers have no NaN: '
-                f'return floats, or write {option}="raise"'
-            )
     if host.executor is not None and not isinstance(host.executor, concurrent.futures.Executor):
         raise TypeError(
             "executor must be a concurrent.futures.Executor, such as ThreadPoolExecutor(4) or "

@@ -6,13 +6,14 @@ but for asking an array whether it is there.
 
 import collections
 import concurrent.futures
+import contextlib
 import dataclasses
 import logging
 import math
 import time
 import traceback
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Generator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -99,13 +100,21 @@ class _Direct:
         return True
 
 
+class _Outcome(NamedTuple):
+    """How a call ended; a call is known by its sample, and None is the one call of a batch."""
+
+    sample: int | None
+    tries: int
+    value: Any
+    error: Exception | None
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class HostFunction:
     """A host function and how it is called; the fields are the arguments of `black_box`."""
 
     fun: Callable[..., Any]
     name: str
-    out_tree: Any
     batched: bool
     executor: concurrent.futures.Executor | None
     on_error: str
@@ -113,14 +122,35 @@ class HostFunction:
     retries: int
     timeout: int | float | None
 
-    def __call__(self, samples: Samples, outs: Sequence[np.ndarray]) -> None:
-        """Evaluates all samples and writes the results into `outs`, one row per sample.
+    def __call__(self, samples: Samples, outs: Sequence[np.ndarray], out_tree: Any) -> None:
+        """Evaluates all samples and writes the results into `outs`, one row per sample."""
+        with contextlib.closing(self._outcomes(samples)) as outcomes:
+            for outcome in outcomes:
+                if outcome.error is None:
+                    self.store(samples, outcome.sample, outcome.value, outs, out_tree)
+                    continue
+                failure = self._failure(samples, outcome, outcome.error)
+                if self.on_error == "raise":
+                    raise failure from outcome.error
+                _log.info("%s", failure)
+                for out in outs:
+                    out[_rows(outcome.sample)] = np.nan
+
+    def first(self, samples: Samples) -> Any:
+        """What a call returns of which nothing is known yet, and which must not fail."""
+        with contextlib.closing(self._outcomes(samples)) as outcomes:
+            (outcome,) = outcomes
+        if outcome.error is not None:
+            raise self._failure(samples, outcome, outcome.error) from outcome.error
+        return outcome.value
+
+    def _outcomes(self, samples: Samples) -> Generator[_Outcome, None, None]:
+        """What each call returned or raised.
 
         Calls are submitted together and awaited in order. A failed one goes to the end of the
         line, as it does in an executor's queue: so what is awaited next is next to run, and a
         timeout does not count the wait for a worker, unless others use the executor too.
         """
-        # A call is known by its sample; None is the one call of a batch.
         calls = [None] if self.batched else range(len(samples))
         queue = collections.deque()
         try:
@@ -136,9 +166,9 @@ class HostFunction:
                     if tries <= self.retries:
                         queue.append((i, tries + 1, self._submit(samples, i)))
                     else:
-                        self._fail(samples, i, tries, error, outs)
+                        yield _Outcome(i, tries, None, error)
                 else:
-                    self._store(samples, i, value, outs)
+                    yield _Outcome(i, tries, value, None)
                 queue.popleft()
         finally:
             for _, _, future in queue:
@@ -162,36 +192,30 @@ class HostFunction:
             future.cancel()
             raise TimeoutError(f"no result within {self.timeout} s") from None
 
-    def _fail(
+    def _failure(self, samples: Samples, outcome: _Outcome, error: Exception) -> BlackBoxError:
+        again = f" (tried {outcome.tries} times)" if outcome.tries > 1 else ""
+        what = f"raised {type(error).__name__}: {error}{again}"
+        return BlackBoxError(f"{self._fault(samples, outcome.sample, what)}\n\n{_trace(error)}")
+
+    def store(
         self,
         samples: Samples,
         i: int | None,
-        tries: int,
-        error: Exception,
+        value: Any,
         outs: Sequence[np.ndarray],
+        out_tree: Any,
     ) -> None:
-        again = f" (tried {tries} times)" if tries > 1 else ""
-        fault = self._fault(samples, i, f"raised {type(error).__name__}: {error}{again}")
-        trace = _trace(error)
-        if self.on_error == "raise":
-            raise BlackBoxError(f"{fault}\n\n{trace}") from error
-        _log.info("%s\n\n%s", fault, trace)
-        for out in outs:
-            out[_rows(i)] = np.nan
-
-    def _store(
-        self, samples: Samples, i: int | None, value: Any, outs: Sequence[np.ndarray]
-    ) -> None:
+        """Writes what a call returned into its rows, if it is what was promised."""
         rows = _rows(i)
         try:
-            leaves = self.out_tree.flatten_up_to(value)
+            leaves = out_tree.flatten_up_to(value)
             for leaf, out in zip(leaves, outs, strict=True):
                 shape = out.shape if i is None else out.shape[1:]
                 out[rows] = as_promised(leaf, out.dtype, shape)
         except (TypeError, ValueError) as error:
             # A mistake in the program, not in a sample: never retried, never turned into NaN.
-            fault = self._fault(samples, i, f"does not return what `out` promises: {error}")
-            raise BlackBoxError(fault) from error
+            what = "does not return what `out` promises, or what it returned at first"
+            raise BlackBoxError(self._fault(samples, i, f"{what}: {error}")) from error
 
         finite = [np.isfinite(out[rows]).all(axis=tuple(range(1, out.ndim))) for out in outs]
         for row in np.flatnonzero(~np.all(finite, axis=0)):

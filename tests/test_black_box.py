@@ -14,7 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from closed_forms import as_users_have_it
 
+import smoothdiff as sd
 from smoothdiff._black_box import black_box, reraise
 from smoothdiff._host_calls import BlackBoxError, wait_for
 
@@ -344,6 +346,155 @@ def test_arguments_are_read_only():
         black_box(host, 0.0)(jnp.zeros(2))
 
 
+@pytest.fixture
+def threads():
+    with concurrent.futures.ThreadPoolExecutor(2) as pool:
+        yield pool
+
+
+# --- found by the first call --------------------------------------------------------------------
+
+
+def found_stairs(batched=False, **options):
+    counted = Counted(stairs, batched)
+    return black_box(counted, batched=batched, **options), counted
+
+
+@pytest.mark.parametrize("threaded", [False, True])
+@pytest.mark.parametrize("batched", [False, True])
+def test_the_first_call_finds_what_is_returned_and_is_a_call_as_any(batched, threaded, threads):
+    options = {"executor": threads} if threaded and not batched else {}
+    box, counted = found_stairs(batched, **options)
+    x, xs = jnp.array([1.5, 2.5]), jnp.linspace(-3.3, 4.1, 12).reshape(6, 2)
+    first = box(x)
+    assert (first, first.dtype, first.shape, counted.samples) == (3.0, jnp.float32, (), 1)
+    np.testing.assert_array_equal(jax.jit(jax.vmap(box))(xs), stairs(np.asarray(xs)))
+    assert box(x) == 3.0
+    assert counted.samples == 8
+
+
+def test_decorators():
+    @black_box
+    def plain(x):
+        """Doubles."""
+        return 2 * x
+
+    @black_box(batched=True, on_nonfinite="nan")
+    def of_a_batch(x):
+        return np.where(x[:, 0] > 0, x[:, 0], np.nan)
+
+    @black_box(out=SCALAR)
+    def promised(x):
+        return x.sum()
+
+    x = jnp.array([1.0, 3.0])
+    assert (plain.__name__, plain.__doc__) == ("plain", "Doubles.")
+    np.testing.assert_array_equal(plain(x), 2 * x)
+    assert of_a_batch(x) == 1.0
+    assert np.isnan(jax.jit(of_a_batch)(-x))
+    assert jax.jit(promised)(x) == 4.0
+
+
+def test_pytrees_are_found():
+    box = black_box(lambda s: {"image": np.ones((2, 3)) * s["a"], "counts": [np.arange(2), True]})
+    s = {"a": jnp.float32(2.0)}
+    first = box(s)
+    assert jax.tree.map(lambda a: (a.dtype.name, a.shape), first) == {
+        "image": ("float32", (2, 3)),  # float64 without x64, and int64 likewise
+        "counts": [("int32", (2,)), ("bool", ())],
+    }
+    jax.tree.map(np.testing.assert_array_equal, jax.jit(box)(s), first)
+
+
+def test_arguments_of_other_shapes_and_types_are_found_anew(x64):
+    box, counted = found_stairs()
+    with jax.enable_x64(False):
+        assert box(jnp.ones(2)).dtype == jnp.float32
+    assert box(jnp.ones(2)).dtype == jnp.float64
+    assert box(jnp.ones((3, 2))).shape == (3,)
+    assert counted.calls == 3
+    assert jax.eval_shape(box, jnp.ones((3, 2))).shape == (3,)
+    with pytest.raises(TypeError, match=r"float64\[4, 2\]"):
+        jax.eval_shape(box, jnp.ones((4, 2)))
+    assert counted.calls == 3
+
+
+@pytest.mark.parametrize(
+    "transform",
+    [
+        jax.jit,
+        jax.grad,
+        lambda f: lambda x: jax.vmap(f)(x[None]),
+        lambda f: lambda x: sd.smooth_grad(f, 0.5)(jax.random.key(0), x),
+        lambda f: (
+            lambda x: sd.minimise(
+                lambda y, _: f(y), x, key=jax.random.key(0), solver=sd.NewtonCG(0.5)
+            )
+        ),
+    ],
+)
+def test_what_is_not_found_yet_cannot_be_traced(transform):
+    box, counted = found_stairs()
+    message = (
+        r"'counted' returns for \(float32\[2\]\).*call it once before.*"
+        r"sd\.black_box\(counted, out=jax\.ShapeDtypeStruct"
+    )
+    with pytest.raises(TypeError, match=message):
+        transform(box)(jnp.ones(2))
+    assert counted.calls == 0
+
+
+def test_after_the_first_call_it_can_be_smoothed_within_the_evaluations(key):
+    box, counted = found_stairs()
+    x = jnp.array([0.2, 1.7])
+    box(x)
+    assert sd.smooth_grad(box, 0.5, num_samples=8)(key, x).shape == (2,)
+    assert counted.samples == 9
+
+
+def test_a_first_call_that_fails_raises_and_finds_nothing():
+    host = Flaky(2)
+    box = black_box(host, on_error="nan", retries=0)
+    for i in range(2):
+        with pytest.raises(BlackBoxError, match=f"licence server, try {i + 1}") as info:
+            box(1.0)
+        assert isinstance(info.value.__cause__, OSError)
+    assert box(1.0) == 1.0
+    assert black_box(Flaky(2), retries=2)(1.0) == 1.0
+    assert np.isnan(black_box(lambda x: x * np.nan, on_nonfinite="nan")(1.0))
+    with pytest.raises(BlackBoxError, match="not finite"):
+        black_box(lambda x: x - np.inf)(1.0)
+
+
+@pytest.mark.parametrize(
+    ("returned", "message"),
+    [
+        (None, "cannot be what the first call returned, None: `out` has no arrays"),
+        ("red", "first call returned, 'red'.*one of its leaves is"),
+        ([[1.0], {}, object()], "one of its leaves is"),
+        (3_000_000_000, "3000000000 does not fit into int32"),
+        (np.ma.masked_array([1.0, 2.0], mask=[False, True]), "mask would be lost"),
+    ],
+)
+def test_a_first_result_that_cannot_be(returned, message):
+    with pytest.raises(BlackBoxError, match=message):
+        black_box(lambda x: returned)(0.25)
+
+
+def test_a_first_batch_without_its_axis():
+    with pytest.raises(BlackBoxError, match=r"shape \(\) for a batch of one.*must begin with"):
+        black_box(lambda x: x.sum(), batched=True)(jnp.ones(3))
+
+
+def test_later_results_must_be_like_the_first():
+    box = black_box(lambda x: 0 if x < 1 else 0.5)
+    assert box(0.0).dtype == jnp.int32
+    with pytest.raises(BlackBoxError, match="returned at first: dtype float64 instead of int32"):
+        box(1.0)
+    with pytest.raises(ValueError, match="integers have no NaN"):
+        black_box(lambda x: 1, on_error="nan")(0.0)
+
+
 # --- faults --------------------------------------------------------------------------------------
 
 
@@ -543,12 +694,6 @@ class Flaky:
         return x
 
 
-@pytest.fixture
-def threads():
-    with concurrent.futures.ThreadPoolExecutor(2) as pool:
-        yield pool
-
-
 @pytest.mark.parametrize("threaded", [False, True])
 def test_retries(threaded, threads):
     executor = threads if threaded else None
@@ -702,7 +847,6 @@ def test_processes():
         ({"executor": True, "timeout": np.nan}, ValueError, "timeout must be a positive"),
         ({"executor": True, "batched": True}, ValueError, "batched=False"),
         ({"out": ()}, TypeError, "jax.ShapeDtypeStruct"),
-        ({"out": None}, TypeError, "jax.ShapeDtypeStruct"),
         ({"out": "float32"}, TypeError, "one of its leaves is"),
         ({"out": np.float32}, TypeError, "one of its leaves is"),
         ({"executor": concurrent.futures.ThreadPoolExecutor}, TypeError, "executor"),
@@ -717,8 +861,11 @@ def test_misuse_says_what_to_write(options, error, message, threads):
 
 
 def test_a_function_is_needed():
-    with pytest.raises(TypeError):
-        black_box(3.0, 0.0)  # pyright: ignore[reportArgumentType]
+    make = as_users_have_it(black_box)
+    with pytest.raises(TypeError, match=r"needs a function.*not 3\.0"):
+        make(3.0, 0.0)
+    with pytest.raises(TypeError, match=r"what it returns is out=\.\.\."):
+        make(SCALAR)(fragile)
 
 
 def test_typed_keys_are_refused(key):
