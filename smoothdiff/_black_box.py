@@ -54,7 +54,8 @@ def black_box(
             `concurrent.futures.Executor`. Processes must be spawned, as a fork of JAX can hang.
         on_error: "raise", or "nan" so that a sample for which `fun` raises an exception or runs out
             of time is NaN in every output (the whole batch if `batched`). `nonfinite="drop"` in the
-            transforms then leaves it out. A wrong structure, shape or dtype always raises.
+            transforms then leaves it out. A wrong structure, shape or dtype always raises, and so
+            does a call that is to find `out`.
         on_nonfinite: "raise", or "nan" so that a sample with a NaN or an infinity in any of its
             outputs is NaN in every output.
         retries: How many times a call that failed is tried again. Takes no part in `on_nonfinite`.
