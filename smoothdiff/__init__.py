@@ -12,11 +12,12 @@ from smoothdiff._host_calls import BlackBoxError
 from smoothdiff._importance import Importance, difference_hvp
 from smoothdiff._large_steps import large_steps
 from smoothdiff._least_squares import LeastSquares
-from smoothdiff._minimise import MinimiseError, Record, Result, least_squares, minimise
+from smoothdiff._minimise import least_squares, minimise
 from smoothdiff._newton_step import newton_step
 from smoothdiff._noise import Noise
 from smoothdiff._quadratic import HessianOperator, QuadraticModel
 from smoothdiff._ranges import Integer, Range
+from smoothdiff._result import MinimiseError, Record, Result
 from smoothdiff._samplers import AbstractSampler, Gaussian, Orthogonal, Sobol, Uniform
 from smoothdiff._smooth import smooth
 from smoothdiff._smooth_first import smooth_grad, smooth_jacobian, smooth_value_and_grad

@@ -17,6 +17,10 @@ from smoothdiff._outputs import Outputs
 from smoothdiff._params import is_concrete
 
 
+class UnknownOutputError(TypeError):
+    """What a black box returns is not known yet, and it may not be called now."""
+
+
 def black_box(
     fun: Callable[..., Any] | None = None,
     out: PyTree = None,
@@ -121,7 +125,7 @@ def black_box(
         call = promised or found.get((tree, shapes))
         if call is None:
             if not all(map(is_concrete, leaves)):
-                raise TypeError(_unknown(name, tree.unflatten(shapes)))
+                raise UnknownOutputError(_unknown(name, tree.unflatten(shapes)))
             result, outputs = _first(host, leaves, tree)
             found[tree, shapes] = _jax_function(host, outputs)
             return result

@@ -4,15 +4,27 @@ import os
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
-import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import PyTree
 from tqdm import tqdm
 
+from smoothdiff._black_box import UnknownOutputError
+from smoothdiff._call_checks import (
+    check_call,
+    check_number,
+    check_residuals,
+    check_solver,
+    explained,
+)
+from smoothdiff._default_solver import default_solver
 from smoothdiff._host_calls import BlackBoxError
-from smoothdiff._run import Limits, MinimiseError, Problem, Record, Result, Run, inexact
-from smoothdiff._solvers import AbstractSmoothSolver
+from smoothdiff._host_steps import HostProblem
+from smoothdiff._limits import Limits
+from smoothdiff._result import MinimiseError, Record, Result
+from smoothdiff._run import Problem, Run, inexact
+from smoothdiff._unit_space import UnitSpace
 
 
 def minimise(
@@ -21,9 +33,13 @@ def minimise(
     args: PyTree = None,
     *,
     key: Any,
-    solver: optx.AbstractMinimiser,
+    solver: optx.AbstractMinimiser | None = None,
+    sigma: PyTree = None,
+    target: float | None = None,
     max_evaluations: int | None = None,
     max_steps: int | None = None,
+    max_seconds: float | None = None,
+    space: PyTree = None,
     bounds: tuple[PyTree, PyTree] | None = None,
     callback: Callable[[Record], Any] | None = None,
     progress: bool = False,
@@ -33,9 +49,16 @@ def minimise(
 
     $$ \min_y F(y), \qquad F(y) = \mathbb{E}_z[f(y + \sigma z, \text{args})] $$
 
-    The iterates are those of `optimistix.minimise(fun, solver, y0, args, options={"key": key})`,
-    with `"bounds": bounds` in the options if there are any. The step is compiled once for each
-    function object and solver, so pass the same ones again rather than new lambdas.
+    Without a solver it is `NewtonCG(sigma)`, and from 100 parameters on `FirstOrder` with Adam,
+    whose steps are 0.15 sigma. Without a sigma it is a fifth of a parameter's range if it has one,
+    else a fifth of the largest number of its leaf of y0, or 0.2 if that is zero. `NewtonCG` needs
+    no more than the order of magnitude.
+
+    The iterates are, but for rounding, those of `optimistix.minimise(fun, solver, y0, args,
+    options={"key": key})`, with `"bounds": bounds` in the options if there are any. With fewer than
+    100 parameters the function is called between steps that are compiled once for all functions.
+    Else a step is compiled for each function object and solver, so pass the same ones again rather
+    than new lambdas.
 
     Ctrl-C ends the run, without a further evaluation, and returns what has been found.
 
@@ -44,11 +67,19 @@ def minimise(
         y0: where to start, a pytree of numbers and arrays.
         args: passed on to `fun`.
         key: a random key; the same key gives the same run.
-        solver: how to step, such as `FirstOrder(optax.adam(0.1), sigma)`.
+        solver: how to step, such as `NewtonCG(sigma)` or `FirstOrder(optax.adam(0.1), sigma)`.
+        sigma: the smoothing width of the default solver, in the units of the parameters: how far
+            from y0 to look at first. A number or a pytree like the parameters.
+        target: a value that is good enough: the run ends where one as low was seen.
         max_evaluations: evaluations of `fun` that are never exceeded. Those that judge the result
             are set aside first, as many as noise would ask for; without noise some are left over.
-        max_steps: steps after which to stop. By default 256, or no limit if `max_evaluations` is
-            given.
+            Without this and `max_steps`, 200 (n + 1) for `NewtonCG` and `GaussNewton` with n < 100
+            parameters, which end by themselves, and 256 steps for others.
+        max_steps: steps after which to stop.
+        max_seconds: seconds after which no further step begins.
+        space: what each parameter may be, such as `Range(1e-3, 10, log=True)`: one space, or a
+            pytree like `y0` of spaces and None. The solver then searches in unit coordinates, in
+            which sigma is given; `fun`, the records and the result have natural values.
         bounds: a pair (low, high), each a number or a pytree like `y0`. `fun` sees no other points.
         callback: called with each step's `Record`; the run stops if it returns something true.
         progress: show a progress bar.
@@ -66,18 +97,18 @@ def minimise(
         TypeError, ValueError: an argument that cannot work; a checkpoint of another problem.
 
     Example:
-        >>> import jax, jax.numpy as jnp, optax, smoothdiff as sd
+        >>> import jax, jax.numpy as jnp, smoothdiff as sd
         >>> plateaus = lambda y, args: jnp.sum(jnp.floor(4 * jnp.abs(y - args)))
-        >>> solver = sd.FirstOrder(optax.adam(0.05), 0.2)
         >>> result = sd.minimise(
-        ...     plateaus, jnp.zeros(2), jnp.array([1.0, -2.0]), key=jax.random.key(0), solver=solver
+        ...     plateaus, jnp.ones(2), jnp.array([1.0, -2.0]), key=jax.random.key(0)
         ... )
         >>> [round(float(y)) for y in result.y]
         [1, -2]
     """
-    loop = (max_evaluations, max_steps, bounds, callback, progress, checkpoint)
-    _check_solver(solver, optx.AbstractMinimiser, "FirstOrder")
-    return _run(fun, y0, args, key, solver, _check_number, *loop)
+    limits = max_steps, max_evaluations, max_seconds, target
+    kind = optx.AbstractMinimiser, "NewtonCG", check_number
+    chosen, where, loop = (solver, sigma, None), (space, bounds), (callback, progress, checkpoint)
+    return _run(kind, fun, y0, args, key, chosen, where, limits, loop)
 
 
 def least_squares(
@@ -86,9 +117,14 @@ def least_squares(
     args: PyTree = None,
     *,
     key: Any,
-    solver: optx.AbstractLeastSquaresSolver,
+    solver: optx.AbstractLeastSquaresSolver | None = None,
+    sigma: PyTree = None,
+    support: Callable[[PyTree], Any] | None = None,
+    target: float | None = None,
     max_evaluations: int | None = None,
     max_steps: int | None = None,
+    max_seconds: float | None = None,
+    space: PyTree = None,
     bounds: tuple[PyTree, PyTree] | None = None,
     callback: Callable[[Record], Any] | None = None,
     progress: bool = False,
@@ -107,9 +143,15 @@ def least_squares(
         y0: where to start, a pytree of numbers and arrays.
         args: passed on to `fun`.
         key: a random key; the same key gives the same run.
-        solver: how to step, such as `GaussNewton(sigma)`.
+        solver: how to step. By default `GaussNewton(sigma)`; `LocalGaussNewton(sigma, support)` if
+            there is a `support`.
+        sigma: as for `minimise`.
+        support: which residuals each parameter may move, as for `LocalGaussNewton`.
+        target: as for `minimise`; half the sum of squares.
         max_evaluations: as for `minimise`.
         max_steps: as for `minimise`.
+        max_seconds: as for `minimise`.
+        space: as for `minimise`.
         bounds: as for `minimise`.
         callback: as for `minimise`.
         progress: as for `minimise`.
@@ -129,74 +171,55 @@ def least_squares(
         >>> bar = lambda y: jnp.where(jnp.abs(pixels - y) < 4.5, 1.0, 0.0)
         >>> result = sd.least_squares(
         ...     lambda y, photo: bar(y) - photo, 15.0, bar(20.0),
-        ...     key=jax.random.key(0), solver=sd.GaussNewton(3.0), max_evaluations=100,
+        ...     key=jax.random.key(0), sigma=3.0, max_evaluations=100,
         ... )
         >>> round(float(result.y))
         20
     """
-    loop = (max_evaluations, max_steps, bounds, callback, progress, checkpoint)
-    _check_solver(solver, optx.AbstractLeastSquaresSolver, "GaussNewton")
-    return _run(fun, y0, args, key, solver, _check_residuals, *loop)
-
-
-def _check_solver(solver: Any, kind: type, example: str) -> None:
-    if not isinstance(solver, AbstractSmoothSolver):
-        raise TypeError(
-            f"solver must be one of smoothdiff's, such as {example}, not {type(solver).__name__}: "
-            "others run under optimistix, on smooth(fun, sigma) with a fixed key"
-        )
-    if not isinstance(solver, kind):
-        raise TypeError(
-            f"{type(solver).__name__} is not for this: functions that return one number go with "
-            "sd.minimise and a solver such as FirstOrder, residuals with sd.least_squares and "
-            "GaussNewton"
-        )
-
-
-def _check_number(out: PyTree) -> None:
-    leaves = jax.tree.leaves(out)
-    if [leaf.shape for leaf in leaves] != [()] or not jnp.issubdtype(leaves[0].dtype, jnp.floating):
-        shapes, dtypes = jax.tree.map(lambda a: a.shape, out), jax.tree.map(lambda a: a.dtype, out)
-        raise TypeError(
-            f"fun returned shape {shapes} and dtype {dtypes}; it must return one real "
-            "floating-point number: use jnp.mean(...) or .astype(float), or give residuals to "
-            "sd.least_squares"
-        )
-
-
-def _check_residuals(out: PyTree) -> None:
-    leaves = jax.tree.leaves(out)
-    if not leaves or not all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves):
-        raise TypeError(
-            f"fun returned {out}; it must return residuals, real floating-point arrays: "
-            "use .astype(float)"
-        )
+    limits = max_steps, max_evaluations, max_seconds, target
+    kind = optx.AbstractLeastSquaresSolver, "GaussNewton", check_residuals
+    chosen, where = (solver, sigma, support), (space, bounds)
+    loop = callback, progress, checkpoint
+    return _run(kind, fun, y0, args, key, chosen, where, limits, loop)
 
 
 def _run(
-    fun: Callable[[PyTree, PyTree], Any],
+    kind: tuple[type, str, Callable[[PyTree], None]],
+    fun: Any,
     y0: PyTree,
     args: PyTree,
     key: Any,
-    solver: Any,
-    check: Callable[[PyTree], None],
-    max_evaluations: int | None,
-    max_steps: int | None,
-    bounds: tuple[PyTree, PyTree] | None,
-    callback: Callable[[Record], Any] | None,
-    progress: bool,
-    checkpoint: str | os.PathLike | None,
+    chosen: tuple[Any, PyTree, Any],
+    where: tuple[PyTree, Any],
+    limits: tuple[Any, ...],
+    loop: tuple[Callable[[Record], Any] | None, bool, str | os.PathLike | None],
 ) -> Result:
+    (interface, example, check), (solver, sigma, support) = kind, chosen
+    (space, bounds), (callback, progress, checkpoint) = where, loop
+    check_call(fun, y0, bounds, space)
+    natural = lambda y: y
+    if space is not None:
+        units = UnitSpace.of(y0, space)
+        fun, y0, natural = units.wrap(fun), units.unit(y0), units.natural
+        bounds = units.bounds()
+        sigma = units.sigma() if sigma is None and solver is None else sigma
     y = jax.tree.map(inexact, y0)
+    if solver is None:
+        residuals = interface is optx.AbstractLeastSquaresSolver
+        solver = default_solver(y, bounds, sigma, residuals, support)
+    else:
+        check_solver(solver, interface, example, sigma, support)
     options = {"key": key} if bounds is None else {"key": key, "bounds": bounds}
-    problem = Problem(fun, solver, args, options)
-    limits = Limits.of(solver, y, max_steps, max_evaluations)
-    run = Run(problem, y, problem.init(y, check))
+    ends = Limits.of(solver, y, *limits)
+    problem = (Problem if solver.sizes(y) is None else HostProblem)(fun, solver, args, options)
+    with explained():
+        state = _first_state(problem, y, check)
+    run = Run(problem, y, state, natural)
     if checkpoint is not None:
         run.attach(checkpoint)
     try:
-        with tqdm(total=limits.expected, initial=run.steps, disable=not progress) as bar:
-            while (reason := run.done() or limits.reached(run)) is None:
+        with tqdm(total=ends.expected, initial=run.steps, disable=not progress) as bar:
+            while (reason := run.done() or run.reached(ends)) is None:
                 record = run.step()
                 text = f"{record.evaluations} evaluations, fun = {record.fun:.4g}"
                 bar.set_postfix_str(text, refresh=False)
@@ -211,3 +234,14 @@ def _run(
         raise MinimiseError(str(error), run.found("failed")) from (error.__cause__ or error)
     finally:
         run.save()
+
+
+def _first_state(problem: Problem, y: PyTree, check: Callable[[PyTree], None]) -> Any:
+    """After an evaluation, which counts, if only that can tell what a black box returns."""
+    try:
+        return problem.init(y, check)
+    except UnknownOutputError:
+        problem.fun(y, problem.args)
+    state = problem.init(y, check)
+    count = state.progress.evaluations
+    return eqx.tree_at(lambda s: s.progress.evaluations, state, count + 1)

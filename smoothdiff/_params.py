@@ -121,6 +121,13 @@ class Params:
         return x if self.low is None else jnp.clip(x, self.low, self.high)
 
 
+def layout_of(y: PyTree[Array]) -> Layout:
+    """That of parameters of which all are smoothed."""
+    leaves, treedef = jax.tree.flatten(y)
+    shapes, dtypes = tuple(x.shape for x in leaves), tuple(x.dtype for x in leaves)
+    return Layout(treedef, shapes, dtypes, (True,) * len(leaves))
+
+
 def choose(args: tuple, argnums: int | Sequence[int]) -> PyTree:
     """The chosen argument, or the tuple of chosen arguments if `argnums` is a sequence."""
     chosen = as_argnums(argnums, len(args))
@@ -189,6 +196,7 @@ def _match(value: PyTree, target: PyTree, what: str) -> list:
         raise ValueError(
             f"{what} must be a number or a pytree with the structure of the parameters, "
             f"{jax.tree.structure(target)}, not {jax.tree.structure(value)}"
+            + ("; a list is a pytree: use np.array" if isinstance(value, list) else "")
         ) from error
     # a None in the parameters themselves is no leaf, so it needs no entry
     return jax.tree.structure(target).flatten_up_to(full)

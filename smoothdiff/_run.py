@@ -5,7 +5,7 @@ import operator
 import os
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,9 +16,10 @@ from jaxtyping import Array, Bool, PyTree
 
 from smoothdiff._black_box import reraise
 from smoothdiff._checkpoint import Checkpoint
-from smoothdiff._solvers import AbstractSmoothSolver, Progress
+from smoothdiff._limits import Limits
+from smoothdiff._result import MinimiseError, Record, Result
+from smoothdiff._solvers import Progress
 
-_DEFAULT_STEPS = 256
 # the share of the time that saving may take
 _SAVING = 0.05
 _NONFINITE = (
@@ -26,66 +27,6 @@ _NONFINITE = (
     'samples, give the solver nonfinite="drop", which leaves them out unless they are too many; '
     "if the iterates run away, take smaller steps or set bounds"
 )
-
-
-class Record(NamedTuple):
-    """One step of `minimise`, in Python numbers and NumPy arrays.
-
-    Attributes:
-        step: which step, from 1.
-        evaluations: evaluations of the function so far.
-        seconds: time since the start, compilation included; a resumed run counts on.
-        fun: the smoothed function where the step started, as its batch estimated it.
-        stderr: the standard error of `fun`; NaN where the batch cannot tell.
-        sigma: the smoothing width of the step, the widest if there are several.
-        y: the iterate after the step.
-    """
-
-    step: int
-    evaluations: int
-    seconds: float
-    fun: float
-    stderr: float
-    sigma: float
-    y: PyTree[np.ndarray]
-
-
-@dataclasses.dataclass(frozen=True)
-class Result:
-    """What `minimise` found.
-
-    Attributes:
-        y: the best point. Of a function without noise, always the lowest that was evaluated. With
-            noise, found by evaluating that point again, the winner of fresh evaluations of a few
-            candidates, the start among them. If the run was cut short ("interrupted", or an error)
-            the lowest that was evaluated, which with noise may be luck.
-        fun: the function there; of least squares half the sum of squares. With noise, the mean of
-            three fresh evaluations.
-        smoothed: the smoothed function there, from a last batch; a point of that batch which is
-            lower still has become `y`. NaN if the run was cut short, or if a sample was not finite.
-        stderr: the standard error of `smoothed`.
-        evaluations: evaluations of the function, the judgement included; not those of a step that
-            was broken off.
-        reason: why the run stopped: "max_steps", "max_evaluations", "callback", "interrupted", or
-            what the solver says, such as "converged"; in an error "nonfinite" or "failed".
-        history: one `Record` for each step.
-    """
-
-    y: PyTree[Array]
-    fun: float
-    smoothed: float
-    stderr: float
-    evaluations: int
-    reason: str
-    history: list[Record] = dataclasses.field(repr=False)
-
-
-class MinimiseError(RuntimeError):
-    """A run failed: `result` is what it had found, `__cause__` what a black box raised."""
-
-    def __init__(self, message: str, result: Result):
-        super().__init__(message)
-        self.result = result
 
 
 class Problem(eqx.Module):
@@ -151,6 +92,7 @@ class Run:
     problem: Problem
     y: PyTree
     state: Any
+    natural: Callable[[PyTree], PyTree] = lambda y: y
     history: list[Record] = dataclasses.field(default_factory=list)
     start: float = dataclasses.field(default_factory=time.monotonic)
     file: Checkpoint | None = None
@@ -161,9 +103,11 @@ class Run:
     def steps(self) -> int:
         return int(self.state.progress.step)
 
-    @property
-    def evaluations(self) -> int:
-        return int(self.state.progress.evaluations)
+    def reached(self, limits: Limits) -> str | None:
+        """Why the limits end the run here, if they do."""
+        progress = self.state.progress
+        seconds, lowest = time.monotonic() - self.start, progress.lowest_fun.item()
+        return limits.reached(self.steps, progress.evaluations.item(), seconds, lowest)
 
     def attach(self, path: str | os.PathLike) -> None:
         """Keeps the run in a file from now on, and takes up the one that is already there."""
@@ -177,7 +121,9 @@ class Run:
             solver=(problem.solver, shapes),
             **({"bounds": None} | problem.options),
         )
-        saved = self.file.load((self.y, self.state, Record(0, 0, 0.0, 0.0, 0.0, 0.0, self.y)))
+        saved = self.file.load(
+            (self.y, self.state, Record(0, 0, 0.0, 0.0, 0.0, 0.0, self.natural(self.y)))
+        )
         if saved is not None:
             self.y, self.state = jax.tree.map(jnp.asarray, saved[:2])
             self.history = _unstack(saved[2])
@@ -212,7 +158,7 @@ class Run:
             fun=progress.fun.item(),
             stderr=progress.stderr.item(),
             sigma=progress.sigma.item(),
-            y=jax.device_get(y),
+            y=jax.device_get(self.natural(y)),
         )
         # Ctrl-C may come between any two lines: the state has the last word on what was done
         self.history.append(record)
@@ -229,54 +175,37 @@ class Run:
         if not jnp.isfinite(stats["fun"]):
             raise MinimiseError(_NONFINITE, self.found("nonfinite"))
         numbers = {name: value.item() for name, value in stats.items()}
-        return Result(y=y, reason=reason, history=self.history, **numbers)
+        return Result(
+            y=self.natural(y),
+            reason=reason,
+            history=self.history,
+            solver=self.problem.solver,
+            state=self.state,
+            **numbers,
+        )
 
     def found(self, reason: str, progress: Progress | None = None) -> Result:
         """The result of a run that was cut short: no evaluation is made for it."""
         p = progress or self.state.progress
         fun, evaluations, unknown = p.lowest_fun.item(), p.evaluations.item(), float("nan")
         history = self.history[: self.steps]
-        return Result(p.lowest_y, fun, unknown, unknown, evaluations, reason, history)
-
-
-class Limits(NamedTuple):
-    """The most steps, and the most evaluations after which there is still room for a step."""
-
-    steps: int | None
-    evaluations: int | None
-    expected: int | None
-
-    @staticmethod
-    def of(
-        solver: AbstractSmoothSolver,
-        y: PyTree,
-        max_steps: int | None,
-        max_evaluations: int | None,
-    ) -> "Limits":
-        if max_evaluations is None:
-            steps = _DEFAULT_STEPS if max_steps is None else max_steps
-            return Limits(steps, None, steps)
-        step, final = solver.evaluations_per_step(y), solver.final_evaluations(y)
-        room = max_evaluations - final - step
-        if room < 0:
-            raise ValueError(
-                f"max_evaluations={max_evaluations} leaves no room: a step takes {step}, judging "
-                f"the result {final}. Allow {step + final}, or lower the solver's num_samples"
-            )
-        fit = room // step + 1
-        return Limits(max_steps, room, fit if max_steps is None else min(fit, max_steps))
-
-    def reached(self, run: Run) -> str | None:
-        if self.steps is not None and run.steps >= self.steps:
-            return "max_steps"
-        if self.evaluations is not None and run.evaluations > self.evaluations:
-            return "max_evaluations"
-        return None
+        return Result(
+            y=self.natural(p.lowest_y),
+            fun=fun,
+            smoothed=unknown,
+            stderr=unknown,
+            evaluations=evaluations,
+            reason=reason,
+            history=history,
+            solver=self.problem.solver,
+            state=self.state,
+        )
 
 
 def inexact(leaf: Any) -> Array:
     leaf = jnp.asarray(leaf)
-    return leaf if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf.astype(float)
+    # a dtype that is given is no weak type, for which everything would be compiled once more
+    return leaf.astype(leaf.dtype if jnp.issubdtype(leaf.dtype, jnp.inexact) else float)
 
 
 def _unstack(records: Record) -> list[Record]:

@@ -426,11 +426,6 @@ def test_arguments_of_other_shapes_and_types_are_found_anew(x64):
         jax.grad,
         lambda f: lambda x: jax.vmap(f)(x[None]),
         lambda f: lambda x: sd.smooth_grad(f, 0.5)(jax.random.key(0), x),
-        lambda f: (
-            lambda x: sd.minimise(
-                lambda y, _: f(y), x, key=jax.random.key(0), solver=sd.NewtonCG(0.5)
-            )
-        ),
     ],
 )
 def test_what_is_not_found_yet_cannot_be_traced(transform):

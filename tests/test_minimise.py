@@ -362,7 +362,7 @@ def test_a_file_that_is_no_checkpoint_is_refused(content, tmp_path):
 @pytest.mark.parametrize(
     ("change", "error", "match"),
     [
-        ({"solver": optx.BFGS(1e-3, 1e-3)}, TypeError, "FirstOrder"),
+        ({"solver": optx.BFGS(1e-3, 1e-3)}, TypeError, "such as NewtonCG"),
         ({"key": 0}, TypeError, r"jax\.random\.key\(0\)"),
         ({"key": None}, ValueError, r"jax\.random\.key\(0\)"),
         ({"fun": lambda y, args: y}, TypeError, "one real floating-point number"),

@@ -153,7 +153,8 @@ def test_a_quadratic_takes_12_evaluations(seeds, dtype):
     for seed in seeds:
         angle = 2 * np.pi * seed / 10
         y0 = target + 2 * np.array([np.cos(angle), np.sin(angle)])
-        result = solve(quadratic, y0, target, sigma=1.0, seed=seed, max_steps=12, dtype=dtype)
+        few = {"max_steps": 12, "rtol": 0.0}
+        result = solve(quadratic, y0, target, sigma=1.0, seed=seed, dtype=dtype, **few)
         assert result.history[-1].evaluations == 12
         assert {leaf.dtype for leaf in jax.tree.leaves(result.history[-1].y)} == {dtype}
         assert {leaf.dtype for leaf in jax.tree.leaves(result.y)} == {dtype}
@@ -166,7 +167,8 @@ def test_rosenbrocks_valley_is_followed_to_its_end(seeds, x64):
         result = solve(
             rosenbrock, (-1.2, 1.0), sigma=0.3, seed=seed, max_evaluations=600, dtype=np.float64
         )
-        assert distance(result.y, 1) < 1e-6, seed
+        assert result.reason == "converged"
+        assert distance(result.y, 1) < 1e-4, seed
 
 
 @few_seeds
@@ -419,7 +421,7 @@ def test_drop_goes_on_without_the_samples_that_fail(sigma):
 
 def test_a_sample_that_is_nan_ends_the_run_with_what_was_found():
     with pytest.raises(sd.MinimiseError, match="NaN or infinite") as caught:
-        solve(abyss, (-3.0, 0.0), (0.6, 0.0), sigma=0.3, max_steps=100)
+        solve(abyss, (-3.0, 0.0), (0.6, 0.0), sigma=0.3, max_steps=100, rtol=0.0)
     found = caught.value.result
     assert found.reason == "nonfinite"
     assert len(found.history) > 0

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from smoothdiff._params import Params, as_key, take_apart
 from smoothdiff._seen import Seen
+from smoothdiff._solvers._point_search import Sizes
 
 # optax and norms mix dtypes (Adam raises a float to an integer), whatever the user's setting
 promotion = partial(jax.numpy_dtype_promotion, "standard")
@@ -101,9 +102,19 @@ class Progress(eqx.Module):
         )
 
 
-def stopped(progress: Progress, enough: Bool[Array, ""]) -> tuple[Bool[Array, ""], optx.RESULTS]:
-    """What `terminate` returns: the run is over after a failed step, or when it is `enough`."""
-    result = optx.RESULTS.where(progress.finite, optx.RESULTS.successful, optx.RESULTS.nonfinite)
+def stopped(
+    progress: Progress, enough: Bool[Array, ""], converged: Bool[Array, ""] | None = None
+) -> tuple[Bool[Array, ""], optx.RESULTS]:
+    """What `terminate` returns: the run is over after a failed step, or when it is `enough`.
+
+    What is enough has stagnated unless it `converged`, as it has where that is not given.
+    """
+    well: Any = optx.RESULTS.successful
+    if converged is not None:
+        stagnation: Any = optx.RESULTS.stagnation
+        # optimistix goes on only while all is well
+        well = optx.RESULTS.where(converged | ~enough, well, stagnation)
+    result = optx.RESULTS.where(progress.finite, well, optx.RESULTS.nonfinite)
     return enough | ~progress.finite, result
 
 
@@ -138,6 +149,10 @@ class AbstractSmoothSolver(eqx.Module):
     @abc.abstractmethod
     def final_evaluations(self, y: PyTree[Array]) -> int:
         """The most evaluations of the function that `postprocess` makes."""
+
+    def sizes(self, y: PyTree[Array]) -> Sizes | None:
+        """Those of a search point by point, or None where each step takes a batch."""
+        return None
 
     def reason(self, state: Any) -> str:
         """One word for why `terminate` asked to stop; called on the host, with a concrete state."""

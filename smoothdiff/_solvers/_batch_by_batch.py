@@ -77,14 +77,19 @@ def _points(solver: Any, params: Params, key: Array, sigma: Array, count: int) -
 
 
 def _batch(
-    solver: Any, residuals: Evaluator, key: Array, sigma: Array, y: PyTree, search: BatchSearch
+    solver: Any,
+    params: Params,
+    residuals: Evaluator,
+    key: Array,
+    sigma: Array,
+    y: PyTree,
+    search: BatchSearch,
 ) -> tuple[ResidualBatch, PyTree]:
     """The iterate and samples around it, fewer of them once they differ; and aux.
 
     With few parameters one of the samples makes way for a point further on.
     """
     first, later, tried = sizes_of(solver, y)
-    params = residuals.params
     points = jnp.concatenate([params.theta[None], _points(solver, params, key, sigma, first - 1)])
     drawn = jnp.ones(first, bool)
     if not tried:
@@ -125,11 +130,11 @@ def step(
     """One batch, one regression, one step."""
     progress, search = state.progress, state.search
     params = smoothed_params(solver, y, progress.step, options)
-    residuals = Evaluator(fn, args, params, True, solver.batch_size)
+    residuals = Evaluator(fn, args, params.layout, True, solver.batch_size)
     key = jax.random.fold_in(read_options(options)[0], progress.step)
     count, _, tried = sizes_of(solver, y)
     sigma = params.sigma * search.scale
-    batch, aux = _batch(solver, residuals, key, sigma, y, search)
+    batch, aux = _batch(solver, params, residuals, key, sigma, y, search)
     history = search.history.after(
         batch.points, batch.rows, half_squares(batch.rows), batch.good, batch.count
     )
@@ -147,7 +152,7 @@ def step(
     point, there = batch.lowest()
     if tried:
         steps = steps_to_try(move, u, history.rows, history.valid, here, count, *sides)
-        move, longest, end, at_end = _best(residuals, sigma, steps, here)
+        move, longest, end, at_end = _best(params, residuals, sigma, steps, here)
         point, there = jnp.where(at_end < there, end, point), jnp.minimum(there, at_end)
     theta = params.clip(center + sigma * move)
     same = batch.same()
@@ -191,24 +196,27 @@ def judge(
     def estimate(y):
         params = smoothed_params(solver, y, progress.step, options)
         points = _points(solver, params, key, params.sigma * scale, count)
-        residuals = Evaluator(fn, args, params, True, solver.batch_size)
+        residuals = Evaluator(fn, args, params.layout, True, solver.batch_size)
         return fresh_loss(residuals, points, solver.nonfinite)
 
     params = smoothed_params(solver, y, progress.step, options)
-    values = Evaluator(fn, args, params, True, solver.batch_size).values
+    values = Evaluator(fn, args, params.layout, True, solver.batch_size).values
     # every iterate but the last was evaluated
     old = progress.start_y, progress.best_y
     return judged(progress, values, estimate, count, [y], old)
 
 
 def _best(
-    residuals: Evaluator, sigma: Array, steps: Float[Array, "k n"], here: Float[Array, " P"]
+    params: Params,
+    residuals: Evaluator,
+    sigma: Array,
+    steps: Float[Array, "k n"],
+    here: Float[Array, " P"],
 ) -> tuple[Array, Array, Array, Array]:
     """The step that leads to the smallest sum of squares, if that is a smaller one, and its length.
 
     Also the end of that step, smaller or not, with half the sum of squares there.
     """
-    params = residuals.params
     ends = kept(jax.vmap(params.clip)(params.theta[None] + sigma[None] * steps))
     found = jnp.sum(residuals(ends)[0] ** 2, axis=1)
     found = jnp.where(jnp.isfinite(found), found, jnp.inf)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from smoothdiff._params import Params
+from smoothdiff._params import Layout
 
 
 class Evaluator(eqx.Module):
@@ -19,7 +19,7 @@ class Evaluator(eqx.Module):
 
     fn: Callable[[PyTree, Any], tuple[PyTree, PyTree]]
     args: PyTree
-    params: Params
+    layout: Layout = eqx.field(static=True)
     squares: bool = eqx.field(static=True)
     batch_size: int | None = eqx.field(static=True)
 
@@ -27,7 +27,7 @@ class Evaluator(eqx.Module):
         """The rows, and the aux of the first."""
 
         def row(x: Array) -> tuple[Array, PyTree]:
-            out, aux = self.fn(self.params.layout.tree(x), self.args)
+            out, aux = self.fn(self.layout.tree(x), self.args)
             leaves = [jnp.ravel(leaf).astype(x.dtype) for leaf in jax.tree.leaves(out)]
             return jnp.concatenate(leaves), aux
 
@@ -36,13 +36,18 @@ class Evaluator(eqx.Module):
 
     def funs(self, rows: Float[Array, "m P"]) -> Float[Array, " m"]:
         """What is minimised, of each row."""
-        return half_squares(rows) if self.squares else rows[:, 0]
+        return objectives(rows, self.squares)
 
     def values(self, points: PyTree[Array]) -> Float[Array, " m"]:
         """What is minimised at stacked points."""
-        vector = self.params.layout.vector
+        vector = self.layout.vector
         rows, _ = self(jax.vmap(lambda y: vector(jax.tree.leaves(y)))(points))
         return self.funs(rows)
+
+
+def objectives(rows: Float[Array, "m P"], squares: bool) -> Float[Array, " m"]:
+    """What is minimised, of each row of residuals, of which the squares are, or of one value."""
+    return half_squares(rows) if squares else rows[:, 0]
 
 
 def half_squares(rows: Float[Array, "m P"]) -> Float[Array, " m"]:

@@ -23,6 +23,7 @@ def judged(
     batch: int,
     new: Sequence[PyTree[Array]],
     old: Sequence[PyTree[Array]] = (),
+    loop: Callable = jax.lax.while_loop,
 ) -> tuple[PyTree[Array], dict[str, Array]]:
     """The best point and the statistics of the run.
 
@@ -42,6 +43,7 @@ def judged(
         batch: The evaluations that `estimate` makes.
         new: Candidates that were never evaluated.
         old: Candidates that were, so that without noise none of them is lower than the lowest.
+        loop: How to repeat evaluations; on the host by a loop of Python's.
 
     Returns:
         The point, and the statistics: `fun`, the function there; `smoothed` and `stderr`, from the
@@ -67,24 +69,32 @@ def judged(
         return done + 1, jax.lax.dynamic_update_slice(found, fresh, (each * done,))
 
     none = jnp.asarray(0, jnp.int32), jnp.full(rounds * each, jnp.nan, dtype)
-    done, found = jax.lax.while_loop(more, evaluated, none)
-    table = found[: _REPEATS * count].reshape(_REPEATS, count)
-    finite = jnp.isfinite(table)
-    least = jnp.min(jnp.where(finite, table, jnp.inf), axis=0)
-    above = jnp.where(finite, table - least[None], 0)
-    noisy = jnp.any(above > 0)
-    # so that the mean of equal values is that value, to the last bit
-    times = jnp.maximum(jnp.sum(finite, axis=0), 1).astype(dtype)
-    means = least + jnp.sum(above, axis=0) / times
-    winner = jnp.argmin(means)
-    y = jax.tree.map(lambda a: a[winner], points)
+    done: Array
+    found: Array
+    done, found = loop(more, evaluated, none)
+    y, fun, noisy = _winner(found, points)
 
     smoothed, stderr, seen = estimate(y)
-    fun, last = means[winner], seen.value.astype(dtype)
+    last = seen.value.astype(dtype)
     lower = ~noisy & (last < fun)
     y, fun = jax.tree.map(lambda a, b: jnp.where(lower, a, b), (seen.point, last), (y, fun))
     evaluations = progress.evaluations + each * done + batch
     return y, {"fun": fun, "smoothed": smoothed, "stderr": stderr, "evaluations": evaluations}
+
+
+@jax.jit
+def _winner(found: Float[Array, " m"], points: PyTree[Array]) -> tuple[PyTree[Array], Array, Array]:
+    """The point with the lowest mean of all its values, that mean, and whether values differ."""
+    count = len(jax.tree.leaves(points)[0])
+    table = found[: _REPEATS * count].reshape(_REPEATS, count)
+    finite = jnp.isfinite(table)
+    least = jnp.min(jnp.where(finite, table, jnp.inf), axis=0)
+    above = jnp.where(finite, table - least[None], 0)
+    # so that the mean of equal values is that value, to the last bit
+    times = jnp.maximum(jnp.sum(finite, axis=0), 1).astype(found.dtype)
+    means = least + jnp.sum(above, axis=0) / times
+    winner = jnp.argmin(means)
+    return jax.tree.map(lambda a: a[winner], points), means[winner], jnp.any(above > 0)
 
 
 def judging(batch: int, new: int, old: int = 0) -> int:

@@ -1,5 +1,6 @@
 """The loop around searches that evaluate a function point by point: bounds, noise, restarts."""
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from smoothdiff._draws import Draws
 from smoothdiff._params import Params
@@ -20,7 +21,7 @@ from smoothdiff._solvers._base import (
     smoothed_params,
     unless_failed,
 )
-from smoothdiff._solvers._evaluator import Evaluator
+from smoothdiff._solvers._evaluator import Evaluator, objectives
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import judged, judging
 from smoothdiff._solvers._point_search import AbstractPointSearch, Sizes
@@ -28,6 +29,8 @@ from smoothdiff._solvers._point_search import AbstractPointSearch, Sizes
 # by default a search ends after so many evaluations for each parameter, and one, without a lower
 # point
 PATIENCE = 20
+# values that are the same at points further apart than so many roots of the rounding: a plateau
+_PLATEAU = 3
 # of at least so many evaluations half must be finite where others may be dropped
 _ENOUGH = 10
 # the widths of later searches without bounds, relative to sigma, as powers of two at random
@@ -49,92 +52,139 @@ def final_evaluations(candidates: int) -> int:
 
 def init(solver: Any, y: PyTree[Array], search: AbstractPointSearch) -> PointState:
     """The state before a search that has evaluated nothing."""
+    _normal_points(solver, jax.random.key(0), 1, search.start)
     restarts = jnp.asarray(solver.restarts, jnp.int32)
     return PointState(Progress.start(y, search.start.dtype), search, restarts)
 
 
-def step(
-    solver: Any,
-    sizes: Sizes,
-    evaluator: Callable[[Params], Evaluator],
-    y: PyTree[Array],
-    options: dict,
-    state: PointState,
-) -> tuple[PyTree[Array], PointState, PyTree]:
-    """The next evaluation, or as many as run at once."""
-    progress, search = state.progress, state.search
-    params = smoothed_params(solver, y, progress.step, options)
-    evaluate = evaluator(params)
-    key = read_options(options)[0]
-    draw = partial(_samples, solver, key, search, params)
-    points, proposal = search.propose(params, draw, sizes)
-    points = kept(jax.vmap(params.clip)(points))
-    rows, aux = evaluate(points)
-    funs = evaluate.funs(rows)
-    good = jnp.isfinite(funs)
-    rows, known = jnp.where(good[:, None], rows, 0), jnp.where(good, funs, 0)
-    after = search.after(params, History(points, rows, known, good), proposal, sizes)
+class PointStep(eqx.Module):
+    """One step in parts, between which the function is evaluated.
 
-    theta, width = after.iterate(), after.width()
-    new_y = params.layout.tree(theta)
-    with promotion():
-        moved = jnp.abs(theta - params.theta) + params.sigma * width
-        small = solver.norm(params.layout.tree(moved)) < solver.atol + solver.rtol * solver.norm(y)
-    point, fun = lowest(points, jnp.where(good, funs, jnp.inf))
-    after = after.counted(small, fun < progress.lowest_fun, sizes.step)
-    # the end of a step that is tried may be anything, and so may a place that nobody asked for
-    later = state.restarts < solver.restarts
-    if solver.nonfinite == "propagate":
-        finite = jnp.all(good) | later
-    else:
-        finite = after.enough(max(sizes.first, _ENOUGH))
-    finite = (finite | search.is_local()) & jnp.all(jnp.isfinite(theta))
-    new_y, after = unless_failed(finite, (new_y, after), (y, search))
-    best = after.history.best(theta)[2]
-    unknown = jnp.asarray(jnp.nan, theta.dtype)
-    seen = Seen(params.layout.tree(point), fun)
-    progress = progress.after(y, best, unknown, params.sigma * width, sizes.step, finite, seen)
-    restarts = state.restarts
-    if solver.restarts:
-        lost = later & ~jnp.any(after.history.valid)
-        ended = (restarts > 0) & after.over(sizes)
-        again = finite & (ended | lost)
-        lowest_theta = params.layout.vector(jax.tree.leaves(progress.lowest_y))
-        place, other = jax.random.split(jax.random.fold_in(key, progress.evaluations))
-        theta = _anywhere(params, place, lowest_theta)
-        start = params.layout.vector(jax.tree.leaves(progress.start_y))
-        anew = after.again(params, theta, start, other)
-        new_y, after = jax.tree.map(
-            lambda a, b: jnp.where(again, a, b), (params.layout.tree(theta), anew), (new_y, after)
-        )
-        restarts = restarts - (finite & ended).astype(restarts.dtype)
-    return new_y, PointState(progress, after, restarts), aux
-
-
-def judge(evaluate: Evaluator, state: PointState) -> tuple[PyTree[Array], dict[str, Array]]:
-    """The best point of those seen and of what the models say.
-
-    The smoothed function is that of the model, at no further evaluation.
+    They know shapes only, so that a host loop compiles them once for all functions.
     """
-    progress = state.progress
-    unknown = jnp.asarray(jnp.nan, progress.fun.dtype)
 
-    def estimate(y: PyTree) -> tuple[Array, Array, Seen]:
-        smoothed = progress.lowest_fun + state.search.smoothing()
-        return smoothed, unknown, Seen(y, jnp.full_like(unknown, jnp.inf))
+    solver: Any
+    sizes: Sizes
+    y: PyTree[Array]
+    options: dict[str, Any]
+    state: PointState
 
-    params = evaluate.params
-    new = [params.layout.tree(params.clip(theta)) for theta in state.search.candidates()]
-    return judged(progress, evaluate.values, estimate, 0, new, [progress.start_y])
+    def params(self) -> Params:
+        """The parameters with the solver's sigma."""
+        return smoothed_params(self.solver, self.y, self.state.progress.step, self.options)
+
+    def propose(self, stage: int | None = None) -> tuple[Float[Array, "K n"], Any]:
+        """The points that come next, within the bounds, and what the model says of them."""
+        params, search = self.params(), self.state.search
+        draw = partial(_samples, self.solver, read_options(self.options)[0], search)
+        points, proposal = search.propose(params, draw, self.sizes, stage)
+        return kept(jax.vmap(params.clip)(points)), proposal
+
+    def searched(
+        self,
+        points: Float[Array, "K n"],
+        rows: Float[Array, "K P"],
+        proposal: Any,
+        stage: int | None = None,
+    ) -> AbstractPointSearch:
+        """The search with what the function returned at these points."""
+        funs = objectives(rows, self.solver.squares)
+        good = jnp.isfinite(funs)
+        rows, known = jnp.where(good[:, None], rows, 0), jnp.where(good, funs, 0)
+        new = History(points, rows, known, good)
+        return self.state.search.after(self.params(), new, proposal, self.sizes, stage)
+
+    def counted(
+        self, points: Float[Array, "K n"], rows: Float[Array, "K P"], after: AbstractPointSearch
+    ) -> tuple[PyTree[Array], PointState]:
+        """The iterate and the state with that search, or with another one if it is over."""
+        solver, sizes, state, params = self.solver, self.sizes, self.state, self.params()
+        progress, search = state.progress, state.search
+        funs = objectives(rows, solver.squares)
+        good = jnp.isfinite(funs)
+        theta, width = after.iterate(), after.width()
+        new_y = params.layout.tree(theta)
+        with promotion():
+            # of steps at several radii the first is that of the model
+            moved = solver.norm(params.layout.tree(points[0] - params.theta))
+            scale = jnp.maximum(solver.norm(self.y), solver.norm(params.layout.tree(params.sigma)))
+            rounding = math.sqrt(jnp.finfo(theta.dtype).eps) * scale
+            small = moved < jnp.maximum(solver.atol + solver.rtol * scale, rounding)
+            small &= (solver.rtol > 0) | (solver.atol > 0)
+            small &= after.settled() & ~after.plateau(_PLATEAU * rounding)
+        point, fun = lowest(points, jnp.where(good, funs, jnp.inf))
+        least = (jnp.minimum(fun, progress.lowest_fun) == 0) & solver.squares
+        after = after.counted(small, fun < progress.lowest_fun, least, sizes.step)
+        # the end of a step that is tried may be anything, and so may a place that nobody asked for
+        later = state.restarts < solver.restarts
+        if solver.nonfinite == "propagate":
+            finite = jnp.all(good) | later
+        else:
+            finite = after.enough(max(sizes.first, _ENOUGH))
+        finite = (finite | search.is_local()) & jnp.all(jnp.isfinite(theta))
+        new_y, after = unless_failed(finite, (new_y, after), (self.y, search))
+        best = after.history.best(theta)[2]
+        unknown = jnp.asarray(jnp.nan, theta.dtype)
+        seen = Seen(params.layout.tree(point), fun)
+        progress = progress.after(
+            self.y, best, unknown, params.sigma * width, sizes.step, finite, seen
+        )
+        restarts = state.restarts
+        if solver.restarts:
+            lost = later & ~jnp.any(after.history.valid)
+            ended = (restarts > 0) & after.over(sizes)
+            # no other search finds less
+            again = finite & (ended | lost) & ~least
+            lowest_theta = params.layout.vector(jax.tree.leaves(progress.lowest_y))
+            key = jax.random.fold_in(read_options(self.options)[0], progress.evaluations)
+            place, other = jax.random.split(key)
+            theta = _anywhere(params, place, lowest_theta)
+            start = params.layout.vector(jax.tree.leaves(progress.start_y))
+            anew = after.again(params, theta, start, other)
+            new_y, after = jax.tree.map(
+                lambda a, b: jnp.where(again, a, b),
+                (params.layout.tree(theta), anew),
+                (new_y, after),
+            )
+            restarts = restarts - (finite & ended).astype(restarts.dtype)
+            restarts = jnp.where(least, 0, restarts)
+        return new_y, PointState(progress, after, restarts)
+
+    def step(self, evaluate: Evaluator) -> tuple[PyTree[Array], PointState, PyTree]:
+        """The next evaluation, or as many as run at once."""
+        points, proposal = self.propose()
+        rows, aux = evaluate(points)
+        return *self.counted(points, rows, self.searched(points, rows, proposal)), aux
+
+    def judge(
+        self,
+        values: Callable[[PyTree[Array]], Float[Array, " m"]],
+        loop: Callable = jax.lax.while_loop,
+    ) -> tuple[PyTree[Array], dict[str, Array]]:
+        """The best point of those seen and of what the models say, by its `values`.
+
+        The smoothed function is that of the model, at no further evaluation.
+        """
+        progress, search, params = self.state.progress, self.state.search, self.params()
+        unknown = jnp.asarray(jnp.nan, progress.fun.dtype)
+
+        def estimate(y: PyTree) -> tuple[Array, Array, Seen]:
+            smoothed = progress.lowest_fun + search.smoothing()
+            return smoothed, unknown, Seen(y, jnp.full_like(unknown, jnp.inf))
+
+        new = [params.layout.tree(params.clip(theta)) for theta in search.candidates()]
+        return judged(progress, values, estimate, 0, new, [progress.start_y], loop)
 
 
-def _samples(
-    solver: Any, key: Array, search: AbstractPointSearch, params: Params, count: int
-) -> Array:
+def _samples(solver: Any, key: Array, search: AbstractPointSearch, count: int) -> Array:
     """Standard normal points for a round."""
-    key = jax.random.fold_in(key, search.round())
+    return _normal_points(solver, jax.random.fold_in(key, search.round()), count, search.start)
+
+
+def _normal_points(solver: Any, key: Array, count: int, like: Float[Array, " n"]) -> Array:
+    """So many, by the solver's sampler, unless that has others."""
     sampler = solver.sampler or Sobol()
-    draws = Draws(sampler, key, count, params.theta.size, params.theta.dtype, None)
+    draws = Draws(sampler, key, count, like.size, like.dtype, None)
     z, log_ratio = draws.map(lambda z, log_ratio: (z, log_ratio))
     if log_ratio is not None or not sampler.gaussian:
         raise ValueError(f"{sampler} has weights: {type(solver).__name__} needs normal points")

@@ -1,10 +1,11 @@
 """What searches have in common that evaluate a function point by point."""
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -60,11 +61,16 @@ class AbstractPointSearch(eqx.Module):
 
     @abc.abstractmethod
     def propose(
-        self, params: Params, draw: Callable[[int], Float[Array, "k n"]], sizes: Sizes
+        self,
+        params: Params,
+        draw: Callable[[int], Float[Array, "k n"]],
+        sizes: Sizes,
+        stage: int | None = None,
     ) -> tuple[Float[Array, "K n"], Any]:
         """The next points to evaluate, not yet within the bounds, and what the model says of them.
 
-        `draw` makes so many samples of the round, which are standard normal.
+        `draw` makes so many samples of the round, which are standard normal. Who knows the stage
+        says it, so that nothing is compiled for the others.
         """
 
     @abc.abstractmethod
@@ -74,8 +80,13 @@ class AbstractPointSearch(eqx.Module):
         new: History,
         proposal: Any,
         sizes: Sizes,
+        stage: int | None = None,
     ) -> "AbstractPointSearch":
         """The search with these new evaluations."""
+
+    @abc.abstractmethod
+    def settled(self) -> Bool[Array, ""]:
+        """Whether a short step is a sign of convergence."""
 
     @abc.abstractmethod
     def over(self, sizes: Sizes) -> Bool[Array, ""]:
@@ -93,9 +104,9 @@ class AbstractPointSearch(eqx.Module):
     def round(self) -> Int[Array, ""]:
         """Counts the rounds of samples, so that each has random numbers of its own."""
 
-    def counted(self, small: Array, lower: Array, count: int) -> Any:
-        """With a small step more or less, and so many evaluations."""
-        small = jnp.where(small, self.small + 1, 0)
+    def counted(self, small: Array, lower: Array, least: Array, count: int) -> Any:
+        """With a small step more or less, and so many evaluations; `least` is as low as can be."""
+        small = jnp.where(least, _SMALL, jnp.where(small, self.small + 1, 0))
         stale = jnp.where(lower, 0, self.stale + count)
         counts = self.evaluated + count, small, stale
         return eqx.tree_at(lambda s: (s.evaluated, s.small, s.stale), self, counts)
@@ -115,6 +126,12 @@ class AbstractPointSearch(eqx.Module):
         """Whether the last steps were small."""
         return self.small >= _SMALL
 
+    def plateau(self, reach: Float[Array, ""]) -> Bool[Array, ""]:
+        """Whether the function is the same as at the best point somewhere further than that."""
+        point, _, fun = self.history.best(self.start)
+        away = jnp.max(jnp.abs(self.history.points - point[None]), axis=1)
+        return jnp.any(self.history.valid & (self.history.funs == fun) & (away > reach))
+
     def is_local(self) -> Bool[Array, ""]:
         """Whether a step within the trust region comes next."""
         return self.stage == TRUST
@@ -122,6 +139,13 @@ class AbstractPointSearch(eqx.Module):
     def iterate(self) -> Float[Array, " n"]:
         """The best point."""
         return self.history.best(self.start)[0]
+
+
+def by_stage(
+    stage: Int[Array, ""], known: int | None, branches: Sequence[Callable[[], Any]]
+) -> Any:
+    """What one of the branches gives: that of the stage, or of the stage that is `known`."""
+    return jax.lax.switch(stage, branches) if known is None else branches[known]()
 
 
 def powers_of_two(count: int, dtype: Any) -> Float[Array, " count"]:

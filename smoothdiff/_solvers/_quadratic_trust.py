@@ -21,7 +21,7 @@ from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._point_search import nothing, powers_of_two
-from smoothdiff._solvers._ratio_test import ratio_test
+from smoothdiff._solvers._ratio_test import ratio_test, settled
 
 # the most evaluations that a model interpolates, if n parameters do not need more
 _MOST = 256
@@ -52,6 +52,7 @@ class QuadraticTrust(eqx.Module):
 
     `improve` says that the next evaluation is for the geometry of the points, not for a step;
     `fails` counts the steps in a row that failed, `slow` the evaluations without a lower point.
+    The last step may be `settled`, see there.
     """
 
     metric: Metric
@@ -60,15 +61,15 @@ class QuadraticTrust(eqx.Module):
     improve: Bool[Array, ""]
     fails: Int[Array, ""]
     slow: Int[Array, ""]
+    settled: Bool[Array, ""]
 
     @staticmethod
     def start(sigma: Float[Array, " n"], radius: Float[Array, ""]) -> "QuadraticTrust":
         """Nothing is known of the function; the metric has sigma as its unit."""
         n, none = len(sigma), jnp.zeros((), jnp.int32)
         hessian = jnp.zeros((n, n), sigma.dtype)
-        return QuadraticTrust(
-            Metric.of(sigma, True), radius, hessian, jnp.asarray(False), none, none
-        )
+        no = jnp.asarray(False)
+        return QuadraticTrust(Metric.of(sigma, True), radius, hessian, no, none, none, no)
 
     def failed(self) -> Bool[Array, ""]:
         """Whether the model is of no use here, or nothing is left to do for it."""
@@ -86,10 +87,8 @@ class QuadraticTrust(eqx.Module):
     def revived(self, radius: Float[Array, ""]) -> "QuadraticTrust":
         """Trusted again, at least as far as this, around another point."""
         none = jnp.zeros_like(self.fails)
-        radius = jnp.maximum(self.radius, radius)
-        return QuadraticTrust(
-            self.metric, radius, self.hessian, jnp.zeros_like(self.improve), none, none
-        )
+        radius, no = jnp.maximum(self.radius, radius), jnp.zeros_like(self.improve)
+        return QuadraticTrust(self.metric, radius, self.hessian, no, none, none, no)
 
     def propose(
         self,
@@ -206,7 +205,9 @@ class QuadraticTrust(eqx.Module):
             lambda a, b: jnp.where(usable, a, b), (metric, turn), (self.metric, still)
         )
         length = jnp.linalg.norm(turn.into(proposal.steps[best]))
-        tried, failed, held, long, fails = ratio_test(before, fun, reduction, self.fails)
+        outcome = ratio_test(before, fun, reduction, self.fails)
+        tried, failed, held, long, fails, _ = outcome
+        radii = self.radius * powers_of_two(len(funs), length.dtype)
         # a model of far points is made better before it is trusted less
         wait = proposal.poor & (fails < 2) & ~long
         lower = jnp.minimum(self.radius, length) * jnp.where(long, 0.1, 0.5)
@@ -220,4 +221,5 @@ class QuadraticTrust(eqx.Module):
             improve=failed & proposal.poor,
             fails=fails,
             slow=jnp.where(fun < before, 0, self.slow + len(funs)).astype(fails.dtype),
+            settled=settled(self.settled, outcome, length, radii[best]),
         )

@@ -9,13 +9,16 @@ from jaxtyping import Array, Bool, Float, Int
 _FAILED, _HELD = 0.1, 0.7
 # a step that raises the function by so many times the predicted reduction was far too long
 _FAR_OFF = 10.0
+# a step of this share of the radius would have been longer without it
+_INSIDE = 0.95
 
 
 class Outcome(NamedTuple):
     """What came of a step; all are false where none was `tried`, as for a point of geometry.
 
     A step that `failed` may have been `long`: far too long. Then the scale is wrong, which says
-    nothing against the model. `fails` counts the other failures in a row.
+    nothing against the model. `fails` counts the other failures in a row. The model promised `more`
+    than rounding may take.
     """
 
     tried: Bool[Array, ""]
@@ -23,6 +26,7 @@ class Outcome(NamedTuple):
     held: Bool[Array, ""]
     long: Bool[Array, ""]
     fails: Int[Array, ""]
+    more: Bool[Array, ""]
 
 
 def ratio_test(
@@ -48,4 +52,21 @@ def ratio_test(
     failed = tried & ~(ratio > _FAILED)
     long = failed & jnp.isfinite(ratio) & (ratio < -_FAR_OFF)
     count = jnp.where(failed & ~long, fails + 1, jnp.where(tried & ~failed, 0, fails))
-    return Outcome(tried, failed, tried & (ratio > _HELD), long, count)
+    rounding = jnp.sqrt(jnp.finfo(before.dtype).eps) * jnp.abs(before)
+    return Outcome(tried, failed, tried & (ratio > _HELD), long, count, reduction > rounding)
+
+
+def settled(
+    before: Bool[Array, ""],
+    outcome: Outcome,
+    length: Float[Array, ""],
+    radius: Float[Array, ""],
+) -> Bool[Array, ""]:
+    """Whether a short step is a sign of convergence, from whether the one before was.
+
+    It is none where the radius alone made it short, as in a valley, or since a step failed that
+    promised more than rounding may take, as where a function jumps.
+    """
+    worked = outcome.tried & ~outcome.failed
+    inside = ~outcome.more | (length < _INSIDE * radius)
+    return inside & (before | worked) & ~(outcome.failed & outcome.more)

@@ -106,5 +106,5 @@ def fresh_loss(
     batch = ResidualBatch.of(points, rows, jnp.asarray(len(points)))
     fun, stderr = batch.loss()
     point, value = batch.lowest()
-    seen = Seen(residuals.params.layout.tree(point), value)
+    seen = Seen(residuals.layout.tree(point), value)
     return jnp.where(batch.enough(nonfinite), fun, jnp.nan), stderr, seen

@@ -18,7 +18,14 @@ from jaxtyping import Array, Bool, Float, Int
 from smoothdiff._params import Params
 from smoothdiff._solvers._first_points import FirstPoints
 from smoothdiff._solvers._history import History
-from smoothdiff._solvers._point_search import FIRST, TRUST, WIDE, AbstractPointSearch, Sizes
+from smoothdiff._solvers._point_search import (
+    FIRST,
+    TRUST,
+    WIDE,
+    AbstractPointSearch,
+    Sizes,
+    by_stage,
+)
 from smoothdiff._solvers._residual_trust import Proposal, TrustRegion
 from smoothdiff._solvers._wide_rounds import Wide, further, sides_of
 
@@ -61,6 +68,10 @@ class ResidualSearch(AbstractPointSearch):
         anew = ResidualSearch.of(theta, empty)
         return eqx.tree_at(lambda s: s.wide.rounds, anew, self.wide.rounds + 1)
 
+    def settled(self) -> Bool[Array, ""]:
+        """The local model's may be none."""
+        return ~self.is_local() | self.trust.settled
+
     def over(self, sizes: Sizes) -> Bool[Array, ""]:
         """Whether it converged, or so many evaluations in a row were no lower."""
         return self.converged() | (self.stale >= sizes.patience)
@@ -85,7 +96,11 @@ class ResidualSearch(AbstractPointSearch):
         return dataclasses.replace(params, sigma=params.sigma * self.first.reach)
 
     def propose(
-        self, params: Params, draw: Callable[[int], Float[Array, "k n"]], sizes: Sizes
+        self,
+        params: Params,
+        draw: Callable[[int], Float[Array, "k n"]],
+        sizes: Sizes,
+        stage: int | None = None,
     ) -> tuple[Float[Array, "K n"], Proposal]:
         """The first points, the end of a step, or the next samples of a round."""
         params = self._scaled(params)
@@ -132,7 +147,7 @@ class ResidualSearch(AbstractPointSearch):
             points = jnp.where(((at == 1) & worth)[:, None], (wide.center + step)[None], points)
             return jnp.where((at == 0)[:, None], wide.center[None], points), nothing
 
-        return jax.lax.switch(self.stage, [first, local, wide])
+        return by_stage(self.stage, stage, [first, local, wide])
 
     def after(
         self,
@@ -140,17 +155,18 @@ class ResidualSearch(AbstractPointSearch):
         new: History,
         proposal: Proposal,
         sizes: Sizes,
+        stage: int | None = None,
     ) -> "ResidualSearch":
         """The search with these residuals at these points."""
         params = self._scaled(params)
         here = self.history.best(self.start)
         with_rows = self.kept(new)
-        by_stage = [
+        branches = [
             lambda: with_rows._after_first(jnp.where(new.valid, new.funs, jnp.inf)),
             lambda: with_rows._after_local(here[1], new.rows, new.valid, proposal),
             lambda: with_rows._after_wide(params, new.rows, new.valid, sizes),
         ]
-        return jax.lax.switch(self.stage, by_stage)
+        return by_stage(self.stage, stage, branches)
 
     def _to_wide(self, scale: Array) -> "ResidualSearch":
         center, row, _ = self.history.best(self.start)

@@ -19,7 +19,7 @@ from smoothdiff._solvers._base import dot
 from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._point_search import powers_of_two
-from smoothdiff._solvers._ratio_test import ratio_test
+from smoothdiff._solvers._ratio_test import ratio_test, settled
 
 # evaluations that a fit may use for each parameter, and how far they count, in radii
 _USED, _REACH, _FARTHEST = 3, 1.5, 2.0
@@ -62,7 +62,7 @@ class TrustRegion(eqx.Module):
     one before and predicted no better, as happens where a function jumps, or changed nothing at
     all; `error` and `length` are those of the last one. `worked` says that some step did not fail,
     and `slow` counts the evaluations in a row that lowered the loss by little or nothing, while the
-    radius did not grow.
+    radius did not grow. The last step may be `settled`, see there.
     """
 
     radius: Float[Array, ""]
@@ -74,6 +74,7 @@ class TrustRegion(eqx.Module):
     length: Float[Array, ""]
     worked: Bool[Array, ""]
     slow: Int[Array, ""]
+    settled: Bool[Array, ""]
 
     @staticmethod
     def start(radius: Float[Array, ""], n: int, size: int) -> "TrustRegion":
@@ -81,7 +82,7 @@ class TrustRegion(eqx.Module):
         none, zero = jnp.zeros((), jnp.int32), jnp.zeros_like(radius)
         jacobian = jnp.zeros((n, size), radius.dtype)
         no = jnp.asarray(False)
-        return TrustRegion(radius, jacobian, no, none, none, zero, zero, no, none)
+        return TrustRegion(radius, jacobian, no, none, none, zero, zero, no, none, no)
 
     def failed(self) -> Bool[Array, ""]:
         """Whether a local model is of no use."""
@@ -174,7 +175,9 @@ class TrustRegion(eqx.Module):
         error = off / jnp.maximum(expected, tiny)
         error = jnp.asarray(jnp.where(jnp.isfinite(fun), error, jnp.inf))
         same = jnp.all(rows[best] == row)
-        tried, failed, held, long, fails = ratio_test(before, fun, reduction, self.fails)
+        outcome = ratio_test(before, fun, reduction, self.fails)
+        tried, failed, held, long, fails, _ = outcome
+        radii = self.radius * powers_of_two(len(funs), length.dtype)
         shorter = (self.fails > 0) & (length < _SHORTER * self.length)
         more = same | (shorter & (error >= _SMOOTH * self.error))
         rough = jnp.where(more, self.rough + 1, self.rough)
@@ -200,6 +203,7 @@ class TrustRegion(eqx.Module):
             length=jnp.where(failed, length, self.length),
             slow=jnp.where((fun < (1 - _LITTLE) * before) | grow, 0, self.slow + len(rows)),
             worked=self.worked | (tried & ~failed),
+            settled=settled(self.settled, outcome, length, radii[best]),
         )
         return revised
 

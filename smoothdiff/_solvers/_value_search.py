@@ -24,6 +24,7 @@ from smoothdiff._solvers._point_search import (
     WIDE,
     AbstractPointSearch,
     Sizes,
+    by_stage,
     nothing,
 )
 from smoothdiff._solvers._quadratic_trust import Proposal, QuadraticTrust
@@ -115,6 +116,10 @@ class ValueSearch(AbstractPointSearch):
         changed = stage, self.rounds + 1, searches, self.noisy
         return eqx.tree_at(lambda s: (s.stage, s.rounds, s.searches, s.noisy), anew, changed)
 
+    def settled(self) -> Bool[Array, ""]:
+        """The local model's may be none."""
+        return ~self.is_local() | self.trust.settled
+
     def over(self, sizes: Sizes) -> Bool[Array, ""]:
         """Whether neither model leads anywhere."""
         lost = _lost(self.center, sizes) & (self.trust.failed() | (self.searches > 0))
@@ -137,7 +142,11 @@ class ValueSearch(AbstractPointSearch):
         return jnp.trace(self.trust.hessian) * self.width() ** 2 / 2
 
     def propose(
-        self, params: Params, draw: Callable[[int], Float[Array, "k n"]], sizes: Sizes
+        self,
+        params: Params,
+        draw: Callable[[int], Float[Array, "k n"]],
+        sizes: Sizes,
+        stage: int | None = None,
     ) -> tuple[Float[Array, "K n"], Proposal]:
         """The first points, the end of a step, or the next samples of a round."""
         n, count = len(self.start), sizes.step
@@ -169,7 +178,7 @@ class ValueSearch(AbstractPointSearch):
             best, *_ = self.history.best(self.start)
             return points.at[0].set(jnp.where(self._checks(), best, points[0])), nothing
 
-        return jax.lax.switch(self.stage, [first, local, wide])
+        return by_stage(self.stage, stage, [first, local, wide])
 
     def after(
         self,
@@ -177,6 +186,7 @@ class ValueSearch(AbstractPointSearch):
         new: History,
         proposal: Proposal,
         sizes: Sizes,
+        stage: int | None = None,
     ) -> "ValueSearch":
         """The search with these new evaluations."""
         before = self.history.best(self.start)[2]
@@ -202,7 +212,7 @@ class ValueSearch(AbstractPointSearch):
             full = lambda: more._stepped(params)._turned(sizes)
             return jax.lax.cond(taken >= sizes.first, full, lambda: more)
 
-        return jax.lax.switch(self.stage, [first, local, wide])
+        return by_stage(self.stage, stage, [first, local, wide])
 
     def _checks(self) -> Bool[Array, ""]:
         """Whether a point is evaluated again that was evaluated before."""

@@ -3,13 +3,14 @@
 import math
 from collections.abc import Callable
 from dataclasses import KW_ONLY
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree
 
+from smoothdiff._params import layout_of
 from smoothdiff._samplers import AbstractSampler
 from smoothdiff._solvers import _batch_by_batch, _point_by_point
 from smoothdiff._solvers._base import AbstractSmoothSolver, check_settings, smoothed_params, stopped
@@ -18,6 +19,9 @@ from smoothdiff._solvers._history import History
 from smoothdiff._solvers._point_search import Sizes
 from smoothdiff._solvers._residual_batch import check_residuals
 from smoothdiff._solvers._residual_search import ResidualSearch
+
+# the default patience of the only search is at least so much, as a plateau may be wide
+_LAST = 100
 
 
 class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
@@ -76,13 +80,14 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         nonfinite: "propagate" or "drop" samples with a NaN or an infinity in their residuals; a
             round that loses half of them is followed by a narrower one. The end of a step that is
             tried may be anything.
-        rtol: relative tolerance. The run has converged when three steps in a row and their width
-            are below `atol + rtol * norm(y)`.
-        atol: absolute tolerance. By default both are zero, and the run uses up its budget.
+        rtol: relative tolerance. The run has converged when three steps in a row are below
+            `atol + rtol * max(norm(y), norm(sigma))`, unless only the radius made them short, or
+            they failed where the model promised more than rounding may take.
+        atol: absolute tolerance.
         norm: the norm of steps and iterates.
-        patience: with restarts, so many evaluations in a row without a lower point end a search, as
-            convergence does; by default 20 (n + 1). With batches it counts steps, by default 30.
-            The last search goes on, and so does the only one.
+        patience: so many evaluations in a row without a lower point end a search; by default
+            20 (n + 1), and 100 if that is more and no other search is to follow. With batches it
+            counts steps, by default 30, and the last search goes on.
         restarts: how many searches may follow, with the first sigma and other random numbers: for
             residuals with several minima, or with plateaus. They begin anywhere within the bounds;
             without bounds around the best point so far, at a random width. With batches they begin
@@ -115,6 +120,8 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     a history.
     """
 
+    squares: ClassVar[bool] = True
+
     sigma: PyTree
     _: KW_ONLY
     num_samples: int | None = None
@@ -122,7 +129,7 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     sampler: AbstractSampler | None = None
     batch_size: int | None = None
     nonfinite: Literal["propagate", "drop"] = "propagate"
-    rtol: float = 0.0
+    rtol: float = 1e-5
     atol: float = 0.0
     norm: Callable[[PyTree], Float[Array, ""]] = optx.max_norm
     patience: int | None = None
@@ -136,29 +143,30 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
                 f"history={kept} is less than num_samples={count}: keep at least a batch"
             )
 
-    def _point_by_point(self, y: PyTree[Array]) -> bool:
-        """Where there are few parameters, but for a schedule, which wants samples of its width."""
-        many = sum(leaf.size for leaf in jax.tree.leaves(y)) >= _batch_by_batch.MANY
-        return not many and not callable(self.sigma)
+    def sizes(self, y: PyTree[Array]) -> Sizes | None:
+        """One evaluation a step, or as many as the user says can run at once.
 
-    def _sizes(self, y: PyTree[Array]) -> Sizes:
-        """One evaluation a step, or as many as the user says can run at once."""
+        None with many parameters, and with a schedule, which wants samples of its width.
+        """
         n = sum(leaf.size for leaf in jax.tree.leaves(y))
+        if n >= _batch_by_batch.MANY or callable(self.sigma):
+            return None
         first = self.num_samples or 4 + int(3 * math.log(n))
         # what the history has need not be seen again
         later = first if self.num_samples else min(first, max(4, n))
-        patience = self.patience or _point_by_point.PATIENCE * (n + 1)
+        patience = self.patience or max(
+            _point_by_point.PATIENCE * (n + 1), 0 if self.restarts else _LAST
+        )
         return Sizes(self.num_samples or 1, first, later, patience)
 
     def evaluations_per_step(self, y: PyTree[Array]) -> int:
         """One, or `num_samples`; with many parameters a batch and the steps that are tried."""
-        if self._point_by_point(y):
-            return self._sizes(y).step
-        return _batch_by_batch.evaluations_per_step(self, y)
+        sizes = self.sizes(y)
+        return sizes.step if sizes else _batch_by_batch.evaluations_per_step(self, y)
 
     def final_evaluations(self, y: PyTree[Array]) -> int:
         """Those that judge the best point."""
-        if self._point_by_point(y):
+        if self.sizes(y):
             return _point_by_point.final_evaluations(candidates=0)
         return _batch_by_batch.final_evaluations(self, y)
 
@@ -166,32 +174,42 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         """Checks what can be looked at; evaluates nothing."""
         check_residuals(f_struct)
         size = sum(leaf.size for leaf in jax.tree.leaves(f_struct))
-        if not self._point_by_point(y):
+        sizes = self.sizes(y)
+        if sizes is None:
             return _batch_by_batch.init(self, y, options, size)
         theta = smoothed_params(self, y, jnp.asarray(0, jnp.int32), options).theta
-        n, first = theta.size, self._sizes(y).first
-        usual = max(min(max(12 * n, 32), 256), 3 * first, 2 * n)
-        length = max(self.history or usual, first, n + 2)
+        n = theta.size
+        usual = max(min(max(12 * n, 32), 256), 3 * sizes.first, 2 * n)
+        length = max(self.history or usual, sizes.first, n + 2)
         search = ResidualSearch.of(theta, History.empty(length, n, size, theta.dtype))
         return _point_by_point.init(self, y, search)
 
     def step(self, fn, y, args, options, state, tags):
         """The next evaluations."""
-        if not self._point_by_point(y):
+        sizes = self.sizes(y)
+        if sizes is None:
             return _batch_by_batch.step(self, fn, y, args, options, state)
-        evaluator = lambda params: Evaluator(fn, args, params, True, self.batch_size)
-        return _point_by_point.step(self, self._sizes(y), evaluator, y, options, state)
+        parts = _point_by_point.PointStep(self, sizes, y, options, state)
+        return parts.step(Evaluator(fn, args, layout_of(y), True, self.batch_size))
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
-        """After small steps in a row, or a failed one."""
-        return stopped(state.progress, state.search.converged())
+        """Where the last search leads nowhere any more, or after a failed step."""
+        sizes, converged = self.sizes(y), state.search.converged()
+        if sizes is None:
+            return stopped(state.progress, converged)
+        over = (state.restarts == 0) & state.search.over(sizes)
+        return stopped(state.progress, over, converged)
+
+    def reason(self, state: Any) -> str:
+        """Small steps, or too many evaluations without a lower point."""
+        return "converged" if state.search.converged() else "stalled"
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         """Judges the best point, with noise beside others."""
-        if not self._point_by_point(y):
+        sizes = self.sizes(y)
+        if sizes is None:
             y, stats = _batch_by_batch.judge(self, fn, y, args, options, state)
         else:
-            params = smoothed_params(self, y, state.progress.step, options)
-            evaluate = Evaluator(fn, args, params, True, self.batch_size)
-            y, stats = _point_by_point.judge(evaluate, state)
+            parts = _point_by_point.PointStep(self, sizes, y, options, state)
+            y, stats = parts.judge(Evaluator(fn, args, layout_of(y), True, self.batch_size).values)
         return y, aux, stats

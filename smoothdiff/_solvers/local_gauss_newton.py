@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from smoothdiff._params import Params
 from smoothdiff._samplers import AbstractSampler, Gaussian
 from smoothdiff._seen import Seen, kept
 from smoothdiff._solvers._base import (
@@ -193,7 +194,7 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         """One batch, one step in each place, the best of nine ends."""
         progress = state.progress
         params = smoothed_params(self, y, progress.step, options)
-        residuals = Evaluator(fn, args, params, True, self.batch_size)
+        residuals = Evaluator(fn, args, params.layout, True, self.batch_size)
         blame = Blame.of(self._blamed(), params.layout.tree, params.theta)
         key = jax.random.fold_in(read_options(options)[0], progress.step)
         sigma = params.sigma * state.scale
@@ -201,7 +202,7 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         points = around(params, self.sampler, key, sigma, self._samples(y))
         rows, aux = residuals(points)
         batch = ResidualBatch.of(points, rows, jnp.asarray(len(points)))
-        theta, at_end = _next(residuals, blame, batch, sigma)
+        theta, at_end = _next(params, residuals, blame, batch, sigma)
 
         fun, stderr = batch.loss()
         scale = state.scale
@@ -237,11 +238,11 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             params = smoothed_params(self, y, progress.step, options)
             sigma = params.sigma * state.scale
             points = around(params, self.sampler, key, sigma, self._samples(y))
-            residuals = Evaluator(fn, args, params, True, self.batch_size)
+            residuals = Evaluator(fn, args, params.layout, True, self.batch_size)
             return fresh_loss(residuals, points, self.nonfinite)
 
         params = smoothed_params(self, y, progress.step, options)
-        values = Evaluator(fn, args, params, True, self.batch_size).values
+        values = Evaluator(fn, args, params.layout, True, self.batch_size).values
         # every iterate but the start is an end that was evaluated
         new, old = [progress.start_y], (y, progress.best_y)
         y, stats = judged(progress, values, estimate, self._samples(y), new, old)
@@ -249,13 +250,16 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
 
 
 def _next(
-    residuals: Evaluator, blame: Blame, batch: ResidualBatch, sigma: Float[Array, " n"]
+    params: Params,
+    residuals: Evaluator,
+    blame: Blame,
+    batch: ResidualBatch,
+    sigma: Float[Array, " n"],
 ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
     """The best of the ends of the steps that a batch suggests, and half the sum of squares there.
 
     Where no end is finite, the iterate and infinity.
     """
-    params = residuals.params
     terms = blame.terms(params.theta).size
     by_term = lambda rows: rows.reshape(-1, terms, rows.shape[1] // terms)
     u = centred(batch.points, batch.good) / sigma[None]

@@ -3,13 +3,14 @@
 import math
 from collections.abc import Callable
 from dataclasses import KW_ONLY
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree
 
+from smoothdiff._params import layout_of
 from smoothdiff._samplers import AbstractSampler
 from smoothdiff._solvers import _newton_batches, _point_by_point
 from smoothdiff._solvers._base import AbstractSmoothSolver, check_settings, smoothed_params, stopped
@@ -68,7 +69,9 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         sampler: where to sample, one whose points are normal; by default `Sobol`.
         nonfinite: "propagate" a sample that is NaN or infinite, which ends the run with an error,
             or "drop" it.
-        rtol: relative tolerance: a step is small if it is below `atol + rtol * norm(y)`.
+        rtol: relative tolerance. The run has converged when three steps in a row are below
+            `atol + rtol * max(norm(y), norm(sigma))`, unless only the radius made them short, or
+            they failed where the model promised more than rounding may take.
         atol: absolute tolerance.
         norm: the norm of steps and iterates.
         patience: a search ends after so many evaluations in a row in which the wide model led
@@ -100,13 +103,15 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     the relaxed test; Powell 2004 for the local model.
     """
 
+    squares: ClassVar[bool] = False
+
     sigma: PyTree
     _: KW_ONLY
     num_samples: int | None = None
     history: int | None = None
     sampler: AbstractSampler | None = None
     nonfinite: Literal["propagate", "drop"] = "propagate"
-    rtol: float = 0.0
+    rtol: float = 1e-5
     atol: float = 0.0
     norm: Callable[[PyTree], Float[Array, ""]] = optx.max_norm
     patience: int | None = None
@@ -117,13 +122,14 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         if self.history is not None and self.history < 2:
             raise ValueError(f"history must be at least 2, or None for the default: {self.history}")
 
-    def _point_by_point(self, y: PyTree[Array]) -> bool:
-        """Where there are few parameters, but for a schedule, which wants samples of its width."""
-        many = sum(leaf.size for leaf in jax.tree.leaves(y)) >= _MANY
-        return not many and not callable(self.sigma)
+    def sizes(self, y: PyTree[Array]) -> Sizes | None:
+        """One evaluation a step, or as many as the user says can run at once.
 
-    def _sizes(self, y: PyTree[Array]) -> Sizes:
+        None with many parameters, and with a schedule, which wants samples of its width.
+        """
         n = sum(leaf.size for leaf in jax.tree.leaves(y))
+        if n >= _MANY or callable(self.sigma):
+            return None
         # about one for each parameter; Sobol points are balanced if they are a power of two
         count = self.num_samples or 2 ** int(math.log2(min(max(n, _FEW), _SOME)))
         patience = self.patience or _point_by_point.PATIENCE * (n + 1)
@@ -131,22 +137,22 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
 
     def evaluations_per_step(self, y: PyTree[Array]) -> int:
         """One, or `num_samples`; with many parameters a batch."""
-        if self._point_by_point(y):
-            return self._sizes(y).step
-        return _newton_batches.evaluations_per_step(self, y)
+        sizes = self.sizes(y)
+        return sizes.step if sizes else _newton_batches.evaluations_per_step(self, y)
 
     def final_evaluations(self, y: PyTree[Array]) -> int:
         """Those that judge the best point."""
-        if self._point_by_point(y):
+        if self.sizes(y):
             return _point_by_point.final_evaluations(candidates=1)
         return _newton_batches.final_evaluations(self, y)
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> Any:
         """Checks what can be looked at; evaluates nothing."""
-        if not self._point_by_point(y):
+        sizes = self.sizes(y)
+        if sizes is None:
             return _newton_batches.init(self, y, options, f_struct.dtype)
         params = smoothed_params(self, y, jnp.asarray(0, jnp.int32), options)
-        theta, sizes = params.theta, self._sizes(y)
+        theta = params.theta
         n = theta.size
         usual = min(max((n + 1) * (n + 2), _newton_batches.FEWEST), _newton_batches.MOST)
         length = max(self.history or usual, sizes.first, n + 2)
@@ -157,31 +163,34 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
 
     def step(self, fn, y, args, options, state, tags):
         """The next evaluations."""
-        if not self._point_by_point(y):
+        sizes = self.sizes(y)
+        if sizes is None:
             return _newton_batches.step(self, fn, y, args, options, state)
-        evaluator = lambda params: Evaluator(fn, args, params, False, None)
-        return _point_by_point.step(self, self._sizes(y), evaluator, y, options, state)
+        parts = _point_by_point.PointStep(self, sizes, y, options, state)
+        return parts.step(Evaluator(fn, args, layout_of(y), False, None))
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """Where the last search leads nowhere any more, or after a failed step."""
-        if self._point_by_point(y):
-            over = (state.restarts == 0) & state.search.over(self._sizes(y))
-        else:
-            over = _newton_batches.over(self, state)
-        return stopped(state.progress, over)
+        sizes = self.sizes(y)
+        if sizes is None:
+            return stopped(state.progress, _newton_batches.over(self, state))
+        over = (state.restarts == 0) & state.search.over(sizes)
+        return stopped(state.progress, over, state.search.converged())
 
     def reason(self, state: Any) -> str:
-        """Small steps, or a gradient that is all noise however many samples there are."""
-        batches = isinstance(state, _newton_batches.NewtonBatchState)
-        center = state.center if batches else state.search.center
-        return "noise" if center.trust.insignificant else "converged"
+        """Small steps, a gradient that is all noise, or too many evaluations for nothing."""
+        if isinstance(state, _newton_batches.NewtonBatchState):
+            return "noise" if state.center.trust.insignificant else "converged"
+        if state.search.converged():
+            return "converged"
+        return "noise" if state.search.center.trust.insignificant else "stalled"
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         """Judges the best point, with noise beside others."""
-        if not self._point_by_point(y):
+        sizes = self.sizes(y)
+        if sizes is None:
             y, stats = _newton_batches.judge(self, fn, y, args, options, state)
         else:
-            params = smoothed_params(self, y, state.progress.step, options)
-            evaluate = Evaluator(fn, args, params, False, None)
-            y, stats = _point_by_point.judge(evaluate, state)
+            parts = _point_by_point.PointStep(self, sizes, y, options, state)
+            y, stats = parts.judge(Evaluator(fn, args, layout_of(y), False, None).values)
         return y, aux, stats

@@ -1,0 +1,101 @@
+"""What is wrong with a call of `minimise` or `least_squares`, and what to write instead."""
+
+import contextlib
+import inspect
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import PyTree
+
+from smoothdiff._solvers import AbstractSmoothSolver
+
+_HOST = (
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerBoolConversionError,
+    jax.errors.TracerIntegerConversionError,
+    jax.errors.ConcretizationTypeError,
+)
+
+
+def check_call(fun: Any, y0: Any, bounds: Any, space: Any) -> None:
+    """Raises TypeError or ValueError for arguments in another order or of another library."""
+    if (
+        isinstance(fun, AbstractSmoothSolver)
+        or callable(y0)
+        or isinstance(y0, AbstractSmoothSolver)
+    ):
+        raise TypeError(
+            "the arguments are (fun, y0, args), and the solver goes by keyword: write "
+            "sd.minimise(fun, y0, args, key=key, solver=solver)"
+        )
+    if not callable(fun):
+        raise TypeError(f"fun must be a function of (y, args), not {type(fun).__name__}")
+    with contextlib.suppress(ValueError):  # some builtins have no signature
+        try:
+            inspect.signature(fun).bind(y0, None)
+        except TypeError as error:
+            raise TypeError(
+                "fun is called as fun(y, args): write lambda y, args: fun(y) if it takes y alone"
+            ) from error
+    pairs = (
+        isinstance(bounds, tuple | list) and len(bounds) > 0 and not isinstance(y0, tuple | list)
+    )
+    if pairs and all(isinstance(b, tuple | list) and len(b) == 2 for b in bounds):
+        raise ValueError(
+            "bounds must be a pair (low, high), each a number or like y0, not a pair for each "
+            "parameter as in SciPy: write low, high = map(jnp.array, zip(*bounds))"
+        )
+
+
+def check_solver(solver: Any, kind: type, example: str, sigma: Any, support: Any) -> None:
+    """Raises TypeError or ValueError unless the solver can run here, with its own settings."""
+    if not isinstance(solver, AbstractSmoothSolver):
+        raise TypeError(
+            f"solver must be one of smoothdiff's, such as {example}, not {type(solver).__name__}: "
+            "others run under optimistix, on smooth(fun, sigma) with a fixed key"
+        )
+    if not isinstance(solver, kind):
+        raise TypeError(
+            f"{type(solver).__name__} is not for this: functions that return one number go with "
+            "sd.minimise and a solver such as FirstOrder, residuals with sd.least_squares and "
+            "GaussNewton"
+        )
+    if sigma is not None or support is not None:
+        name = "sigma" if sigma is not None else "support"
+        raise ValueError(
+            f"{name} is for the default solver: give it to yours, {type(solver).__name__}(...)"
+        )
+
+
+def check_number(out: PyTree) -> None:
+    leaves = jax.tree.leaves(out)
+    if [leaf.shape for leaf in leaves] != [()] or not jnp.issubdtype(leaves[0].dtype, jnp.floating):
+        shapes, dtypes = jax.tree.map(lambda a: a.shape, out), jax.tree.map(lambda a: a.dtype, out)
+        raise TypeError(
+            f"fun returned shape {shapes} and dtype {dtypes}; it must return one real "
+            "floating-point number: use jnp.mean(...) or .astype(float), or give residuals to "
+            "sd.least_squares"
+        )
+
+
+def check_residuals(out: PyTree) -> None:
+    leaves = jax.tree.leaves(out)
+    if not leaves or not all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves):
+        raise TypeError(
+            f"fun returned {out}; it must return residuals, real floating-point arrays: "
+            "use .astype(float)"
+        )
+
+
+@contextlib.contextmanager
+def explained() -> Iterator[None]:
+    """JAX's errors about functions that it cannot trace say what to write instead."""
+    try:
+        yield
+    except _HOST as error:
+        raise TypeError(
+            "fun does what JAX cannot trace, such as NumPy on its arguments: wrap what is not "
+            "JAX in sd.black_box(fun, out), or use jax.numpy"
+        ) from error

@@ -1,0 +1,78 @@
+"""What is chosen where the user chooses nothing: the solver and its sigma."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, PyTree
+
+from smoothdiff._solvers import FirstOrder, GaussNewton, LocalGaussNewton, NewtonCG
+
+# from so many parameters on a quadratic model takes too many evaluations
+_MANY = 100
+# sigma as a share of a parameter's range, or else of the largest number of its leaf
+_SHARE = 0.2
+# a step of Adam, in sigmas
+_RATE = 0.15
+
+
+def default_sigma(y: PyTree[Array], bounds: tuple[PyTree, PyTree] | None) -> PyTree[Array]:
+    """A fifth of each parameter's range; without one a fifth of the largest number of its leaf.
+
+    It is 0.2 where all numbers of a leaf without a range are zero.
+    """
+    leaves, treedef = jax.tree.flatten(y)
+    none = (None,) * len(leaves)
+    sides = none, none
+    if bounds is not None:
+        full = [jax.tree.broadcast(side, y, is_leaf=lambda b: b is None) for side in bounds]
+        sides = tuple(treedef.flatten_up_to(side) for side in full)
+    return treedef.unflatten(map(_width, leaves, *sides))
+
+
+def default_solver(
+    y: PyTree[Array],
+    bounds: tuple[PyTree, PyTree] | None,
+    sigma: PyTree | None,
+    residuals: bool,
+    support: Callable[[PyTree], Array] | None = None,
+) -> Any:
+    """The rule that `minimise` and `least_squares` state."""
+    usual = default_sigma(y, bounds)
+    if sigma is None:
+        sigma = usual
+    elif any(width is None for width in jax.tree.leaves(sigma, is_leaf=_is_none)):
+        # what a space says nothing of
+        full = jax.tree.broadcast(sigma, y, is_leaf=_is_none)
+        sigma = jax.tree.map(lambda s, d: d if s is None else s, full, usual, is_leaf=_is_none)
+    if residuals:
+        return GaussNewton(sigma) if support is None else LocalGaussNewton(sigma, support)
+    if sum(leaf.size for leaf in jax.tree.leaves(y)) < _MANY:
+        return NewtonCG(sigma)
+    return FirstOrder(optax.chain(optax.scale_by_adam(), _in_sigmas(sigma)), sigma)
+
+
+def _is_none(leaf: Any) -> bool:
+    return leaf is None
+
+
+def _in_sigmas(sigma: PyTree) -> optax.GradientTransformation:
+    """A step of so many sigmas of each parameter, downhill."""
+
+    def update(updates: PyTree[Array], _: PyTree) -> PyTree[Array]:
+        widths = jax.tree.broadcast(sigma, updates)
+        return jax.tree.map(lambda u, s: (-_RATE * s * u).astype(u.dtype), updates, widths)
+
+    return optax.stateless(update)
+
+
+def _width(leaf: Array, low: Any, high: Any) -> Array:
+    size = float(np.max(np.abs(np.asarray(leaf)), initial=0.0)) or 1.0
+    width = jnp.full(leaf.shape, _SHARE * size, leaf.dtype)
+    if low is None or high is None:
+        return width
+    span = jnp.broadcast_to(jnp.asarray(high) - jnp.asarray(low), leaf.shape).astype(leaf.dtype)
+    return jnp.where(jnp.isfinite(span) & (span > 0), _SHARE * span, width)

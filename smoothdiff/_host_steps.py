@@ -1,0 +1,130 @@
+"""Steps of a search point by point on the host: the function is called between compiled parts.
+
+The parts know shapes only. So they are compiled once for all functions, keys, sigmas and budgets,
+and only for those stages that a run comes to.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PyTree
+
+from smoothdiff._params import layout_of
+from smoothdiff._run import Problem
+from smoothdiff._solvers._base import smoothed_params
+from smoothdiff._solvers._evaluator import Evaluator
+from smoothdiff._solvers._point_by_point import PointState, PointStep
+from smoothdiff._solvers._point_search import AbstractPointSearch
+
+# with a history of fewer numbers a step is short, and compiling it well would take longer than all
+# of the steps
+_SHORT = 1_000_000
+
+
+class HostProblem(Problem):
+    """A problem whose solver steps point by point."""
+
+    def init(self, y: PyTree, check: Callable[[PyTree], None]) -> PointState:
+        """As for any problem, compiled for shapes once the values were looked at."""
+        fn = _Function(self.fun)
+        out = jax.eval_shape(lambda y: fn(y, self.args)[0], y)
+        check(out)
+        smoothed_params(self.solver, y, jnp.asarray(0, jnp.int32), self.options)
+        return _first_state(*self._general(), y, out)
+
+    def step(self, y: PyTree, state: PointState) -> tuple[PyTree, PointState, Bool[Array, ""]]:
+        """The next evaluations, between what is compiled for the stage of the search."""
+        step, stage = self._parts(y, state), int(state.search.stage)
+        propose, searched, counted = _compiled(state.search.history.rows.size)
+        points, proposal = propose(step, stage)
+        rows = _rows(self._evaluator(y), points)
+        return counted(step, points, rows, searched(step, points, rows, proposal, stage))
+
+    def judge(self, y: PyTree, state: PointState) -> tuple[PyTree, dict[str, Any]]:
+        """Decided on the host, so that nothing is compiled for it."""
+        evaluate, at_once = self._evaluator(y), self.solver.sizes(y).step
+
+        # as many at once as in a step, by the program that evaluated them before
+        def values(points: PyTree[Array]) -> Array:
+            vectors = jax.vmap(lambda y: evaluate.layout.vector(jax.tree.leaves(y)))(points)
+            parts = [vectors[i : i + at_once] for i in range(0, len(vectors), at_once)]
+            rows = jnp.concatenate([_rows(evaluate, part) for part in parts])
+            return evaluate.funs(rows)
+
+        return self._parts(y, state).judge(values, _loop)
+
+    def _parts(self, y: PyTree, state: PointState) -> PointStep:
+        solver, options = self._general()
+        return PointStep(solver, self.solver.sizes(y), y, options, state)
+
+    def _general(self) -> tuple[Any, dict[str, Any]]:
+        """The solver and the options, in which all that does not decide shapes is an array."""
+        solver, options = self.solver, dict(self.options)
+        numbers = jax.tree.map(jnp.asarray, (solver.sigma, solver.rtol, solver.atol))
+        if "bounds" in options:
+            options["bounds"] = jax.tree.map(jnp.asarray, options["bounds"])
+        return eqx.tree_at(lambda s: (s.sigma, s.rtol, s.atol), solver, numbers), options
+
+    def _evaluator(self, y: PyTree) -> Evaluator:
+        size = getattr(self.solver, "batch_size", None)
+        return Evaluator(_Function(self.fun), self.args, layout_of(y), self.solver.squares, size)
+
+
+class _Function(eqx.Module):
+    """The user's function as optimistix calls it."""
+
+    fun: Callable[[PyTree, PyTree], Any]
+
+    def __call__(self, y: PyTree, args: PyTree) -> tuple[PyTree[Array], None]:
+        return jax.tree.map(jnp.asarray, self.fun(y, args)), None
+
+
+@eqx.filter_jit
+def _first_state(solver: Any, options: dict[str, Any], y: PyTree[Array], out: PyTree) -> PointState:
+    state = solver.init(None, y, None, options, out, None, frozenset())
+    # weak types would compile the second step anew
+    return jax.tree.map(lambda a: jnp.asarray(a, a.dtype), state)
+
+
+@eqx.filter_jit
+def _rows(evaluate: Evaluator, points: Float[Array, "K n"]) -> Float[Array, "K P"]:
+    return evaluate(points)[0]
+
+
+def _propose(step: PointStep, stage: int) -> tuple[Array, Any]:
+    return step.propose(stage)
+
+
+def _searched(
+    step: PointStep, points: Array, rows: Array, proposal: Any, stage: int
+) -> AbstractPointSearch:
+    return step.searched(points, rows, proposal, stage)
+
+
+def _counted(
+    step: PointStep, points: Array, rows: Array, after: AbstractPointSearch
+) -> tuple[PyTree, PointState, Bool[Array, ""]]:
+    """Also whether the solver wants to stop there."""
+    y, state = step.counted(points, rows, after)
+    return y, state, step.solver.terminate(None, y, None, step.options, state, frozenset())[0]
+
+
+_jit: Any = eqx.filter_jit
+_PARTS = _propose, _searched, _counted
+_WELL = [_jit(part) for part in _PARTS]
+_QUICKLY = [_jit(part, compiler_options={"xla_backend_optimization_level": 0}) for part in _PARTS]
+
+
+def _compiled(size: int) -> list[Callable]:
+    """The parts for a history of so many numbers."""
+    return _QUICKLY if size < _SHORT and jax.default_backend() == "cpu" else _WELL
+
+
+def _loop(more: Callable, body: Callable, state: Any) -> Any:
+    """`jax.lax.while_loop` on the host."""
+    while more(state):
+        state = body(state)
+    return state

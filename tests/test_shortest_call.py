@@ -1,0 +1,248 @@
+"""The shortest calls: what is chosen, when a run ends, what wrong arguments are told."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+from closed_forms import as_users_have_it
+
+import smoothdiff as sd
+
+KEY = jax.random.key(0)
+minimise, least_squares = as_users_have_it(sd.minimise), as_users_have_it(sd.least_squares)
+TARGET = (1.0, -2.0, 0.5)
+
+
+def bowl(y, args):
+    return jnp.sum((y - jnp.array(TARGET, y.dtype)) ** 2)
+
+
+def valley(y, args):
+    return jnp.array([10 * (y[1] - y[0] ** 2), 1 - y[0]])
+
+
+def cubes(y, args):
+    return y**3 - jnp.array(TARGET, y.dtype)
+
+
+def stairs(y, args):
+    return jnp.sum(jnp.floor(4 * jnp.abs(y - jnp.array(TARGET, y.dtype))))
+
+
+# what is chosen
+
+
+def test_few_parameters_get_newton_cg_and_residuals_gauss_newton(x64):
+    result = sd.minimise(bowl, jnp.ones(3), key=KEY)
+    assert isinstance(result.solver, sd.NewtonCG)
+    assert (result.reason, result.result) == ("converged", optx.RESULTS.successful)
+    np.testing.assert_allclose(result.y, TARGET, atol=1e-4)
+    result = sd.least_squares(valley, jnp.array([-1.2, 1.0]), key=KEY)
+    assert isinstance(result.solver, sd.GaussNewton)
+    assert result.reason == "converged"
+    np.testing.assert_allclose(result.value, 1, atol=1e-4)
+    assert result.evaluations < 100
+    assert result.stats["fun"] == result.fun
+
+
+def test_many_parameters_get_first_order_and_a_support_its_own_solver():
+    y0 = jnp.zeros(100)
+    result = sd.minimise(lambda y, _: jnp.sum((y - 1) ** 2), y0, key=KEY, max_steps=30)
+    assert isinstance(result.solver, sd.FirstOrder)
+    assert result.fun < 90
+    terms = lambda y, _: jnp.where(y > 0.1, 1.0, y)
+    result = sd.least_squares(
+        terms, y0, key=KEY, sigma=0.2, support=lambda y: y, max_evaluations=400
+    )
+    assert isinstance(result.solver, sd.LocalGaussNewton)
+
+
+@pytest.mark.parametrize(
+    ("y0", "bounds", "sigma"),
+    [
+        ({"a": 0.0, "b": np.array([3.0, -5.0])}, None, {"a": 0.2, "b": [1.0, 1.0]}),
+        ({"a": 1e-6, "b": 0.0}, (-1.0, 4.0), {"a": 1.0, "b": 1.0}),
+        ({"a": 2.0, "b": 2.0}, (None, {"a": 3.0, "b": 12.0}), {"a": 0.4, "b": 0.4}),
+        (np.array([2.0, 2.0]), (np.array([1.0, -np.inf]), 3.0), [0.4, 0.4]),
+    ],
+)
+def test_sigma_is_a_share_of_the_range_or_of_the_start(y0, bounds, sigma):
+    total = lambda y, _: sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(y))
+    result = sd.minimise(total, y0, key=KEY, bounds=bounds, max_steps=1)
+    expected = jax.tree.leaves(sigma, is_leaf=lambda s: isinstance(s, list))
+    for one, other in zip(jax.tree.leaves(result.solver.sigma), expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6)
+
+
+def test_ten_starts_on_stairs_need_no_setting():
+    found = [float(sd.minimise(stairs, jnp.zeros(3), key=jax.random.key(k)).fun) for k in range(5)]
+    assert np.median(found) <= 1
+
+
+# when a run ends
+
+
+def test_a_target_ends_the_run():
+    result = sd.minimise(bowl, jnp.ones(3), key=KEY, target=0.5)
+    assert (result.reason, result.result) == ("target", optx.RESULTS.successful)
+    assert result.fun <= 0.5
+
+
+def test_seconds_end_the_run():
+    result = sd.minimise(stairs, jnp.zeros(3), key=KEY, max_seconds=0.0)
+    assert result.reason == "max_seconds"
+    assert result.result == optx.RESULTS.nonlinear_max_steps_reached
+    assert not result.history
+
+
+def test_a_plateau_is_no_convergence(x64):
+    result = sd.minimise(lambda y, _: 0 * jnp.sum(y), jnp.ones(3), key=KEY)
+    assert result.reason in ("noise", "stalled")
+    assert result.result == optx.RESULTS.stagnation
+    result = sd.least_squares(lambda y, _: 0 * y + 1, jnp.ones(3), key=KEY)
+    assert result.reason == "stalled"
+
+
+def test_no_lower_sum_of_squares_than_zero_is_sought():
+    pixels = jnp.arange(32.0)
+    bar = lambda y: jnp.where(jnp.abs(pixels - y) < 4.5, 1.0, 0.0)
+    result = sd.least_squares(lambda y, _: bar(y) - bar(20.0), 15.0, key=KEY, sigma=3.0)
+    assert (result.fun, result.reason) == (0, "converged")
+    assert result.evaluations < 30
+
+
+@pytest.mark.parametrize(
+    ("limit", "match"),
+    [
+        ({"max_evaluations": float("nan")}, "max_evaluations=nan must be a whole number"),
+        ({"max_evaluations": 1.5}, "max_evaluations=1.5 must be a whole number"),
+        ({"max_steps": -1}, "max_steps=-1 must be a whole number"),
+        ({"max_seconds": float("nan")}, "max_seconds is NaN"),
+        ({"max_seconds": -1.0}, "max_seconds=-1.0 must be 0 or more"),
+        ({"target": float("nan")}, "target is NaN"),
+        ({"max_evaluations": 3}, "leaves no room"),
+    ],
+)
+def test_limits_that_are_none_are_refused(limit, match):
+    with pytest.raises(ValueError, match=match):
+        minimise(bowl, jnp.ones(3), key=KEY, **limit)
+
+
+# under optimistix
+
+
+def test_solvers_end_by_themselves_under_optimistix(x64):
+    options = {"key": KEY}
+    found = optx.minimise(bowl, sd.NewtonCG(0.1), jnp.ones(3), options=options, max_steps=1000)
+    np.testing.assert_allclose(found.value, TARGET, atol=1e-4)
+    assert found.result == optx.RESULTS.successful
+    found = optx.least_squares(
+        valley, sd.GaussNewton(0.1), jnp.array([-1.2, 1.0]), options=options, max_steps=1000
+    )
+    np.testing.assert_allclose(found.value, 1, atol=1e-4)
+    flat = optx.minimise(
+        lambda y, _: 0 * jnp.sum(y),
+        sd.NewtonCG(0.1),
+        jnp.ones(3),
+        options=options,
+        max_steps=1000,
+        throw=False,
+    )
+    assert flat.result == optx.RESULTS.stagnation
+
+
+def test_the_host_takes_the_steps_of_optimistix(x64):
+    """But for rounding: the parts of a step are compiled each by itself."""
+    for solver, run, twin, fun in [
+        (sd.NewtonCG(0.3), sd.minimise, optx.minimise, bowl),
+        (
+            sd.GaussNewton(0.3),
+            sd.least_squares,
+            optx.least_squares,
+            lambda y, _: y**3 - jnp.array(TARGET, y.dtype),
+        ),
+    ]:
+        result = run(fun, jnp.ones(3), key=KEY, solver=solver, max_steps=14)
+        options = {"key": KEY}
+        found = twin(fun, solver, jnp.ones(3), options=options, max_steps=14, throw=False)
+        lowest = found.state.progress.lowest_y
+        np.testing.assert_allclose(result.y, lowest, rtol=1e-6, atol=1e-9)
+
+
+# compiled once
+
+
+def test_another_function_or_sigma_compiles_nothing_but_the_function(monkeypatch):
+    traced = []
+
+    def run(fun, key, sigma):
+        sd.least_squares(fun, jnp.ones(3), key=key, solver=sd.GaussNewton(sigma), max_steps=30)
+
+    def residuals(shift):
+        def fun(y, _):
+            traced.append(shift)
+            return y**3 - shift * jnp.array(TARGET)
+
+        return fun
+
+    run(residuals(1.0), KEY, 0.3)
+    before = len(traced)
+    with jax.log_compiles(), pytest.MonkeyPatch.context() as patch:
+        compiled = []
+        log = jax._src.interpreters.pxla.logger
+        patch.setattr(log, "log", lambda level, text, *args: compiled.append(text % args))
+        run(residuals(2.0), jax.random.key(1), 0.2)
+    ours = [line for line in compiled if "Compiling" in line and "_rows" not in line]
+    assert not [line for line in ours if "_propose" in line or "_searched" in line], ours
+    assert len(traced) <= 2 * before
+
+
+# what is told
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "match"),
+    [
+        (lambda: minimise(lambda y: y, 1.0, key=KEY), TypeError, "write lambda y, args: fun"),
+        (
+            lambda: minimise(bowl, sd.NewtonCG(1.0), jnp.ones(3), key=KEY),
+            TypeError,
+            "by keyword",
+        ),
+        (lambda: minimise(3.0, jnp.ones(3), key=KEY), TypeError, "fun must be a function"),
+        (
+            lambda: minimise(lambda y, _: np.sum(np.asarray(y)), jnp.ones(3), key=KEY),
+            TypeError,
+            "sd.black_box",
+        ),
+        (
+            lambda: least_squares(lambda y, _: np.sin(float(y[0])), jnp.ones(3), key=KEY),
+            TypeError,
+            "sd.black_box",
+        ),
+        (
+            lambda: minimise(bowl, jnp.ones(3), key=KEY, bounds=[(0, 1), (0, 1), (0, 1)]),
+            ValueError,
+            "as in SciPy",
+        ),
+        (
+            lambda: minimise(bowl, jnp.ones(3), key=KEY, sigma=[0.1, 0.1, 0.1]),
+            ValueError,
+            "a list is a pytree: use np.array",
+        ),
+        (
+            lambda: least_squares(valley, jnp.ones(2), key=KEY, solver=sd.NewtonCG(0.1)),
+            TypeError,
+            "sd.minimise",
+        ),
+        (
+            lambda: minimise(bowl, jnp.ones(3), key=KEY, solver=sd.NewtonCG(1.0), sigma=0.1),
+            ValueError,
+            r"give it to yours, NewtonCG\(",
+        ),
+    ],
+)
+def test_wrong_arguments_are_told_what_to_write(call, error, match):
+    with pytest.raises(error, match=match):
+        call()
