@@ -1,7 +1,8 @@
 """What derivatives cost beyond the evaluations that they need, on Box10.
 
 A gradient, a Hessian and a Hessian-vector product of N = 256 samples are timed against drawing the
-same points and evaluating the function there, and the ratio is taken turn by turn.
+same points and evaluating the function there, and the ratio is taken turn by turn. Then what a run
+of a solver costs before its function does: CPU seconds to the first steps, and of a second call.
 """
 
 from argparse import Namespace
@@ -18,10 +19,11 @@ import smoothdiff as sd
 from benchmarks._grid import Grid
 from benchmarks._summary import quarters
 from benchmarks._timing import compiled
+from benchmarks.studies import _startup
 from benchmarks.studies._listed import dots, listed
 from benchmarks.tasks.boxes import BOX10_START, box10_loss
 
-HELP = "derivatives against evaluating at the same points"
+HELP = "derivatives against evaluating at the same points, and what a run costs before its function"
 OPTIONS = ()
 SAMPLES = 256
 SIGMA = 0.1
@@ -68,7 +70,14 @@ def measure(options: Namespace, folder: Path) -> dict[str, Any]:
                 "ms of evaluating": 1e3 * np.median(evaluations).item(),
             }
         )
-    return {"samples": SAMPLES, "turns": TURNS, "target": TARGET, "lines": lines}
+    startup = _startup.measured()
+    return {
+        "samples": SAMPLES,
+        "turns": TURNS,
+        "target": TARGET,
+        "lines": lines,
+        "startup": startup,
+    }
 
 
 def tables(results: dict[str, Any]) -> Iterator[Grid]:
@@ -77,6 +86,12 @@ def tables(results: dict[str, Any]) -> Iterator[Grid]:
         f"Box10, {results['samples']} samples: time over evaluating at the same points",
         f"Median [quartiles] of {results['turns']} turns; target: at most {results['target']:.2f}.",
         results["lines"],
+    )
+    yield listed(
+        f"{_startup.PARAMETERS} parameters, {_startup.RESIDUALS} residuals: CPU seconds to a step",
+        f"Of a NumPy function; medians of {_startup.PROCESSES} processes. At most 2 s to "
+        "the first step are aimed at, and 0.1 s again.",
+        results["startup"],
     )
 
 
