@@ -19,6 +19,7 @@ from smoothdiff._quadratic import HessianOperator, QuadraticModel
 from smoothdiff._ranges import Integer, Range
 from smoothdiff._result import MinimiseError, Record, Result
 from smoothdiff._samplers import AbstractSampler, Gaussian, Orthogonal, Sobol, Uniform
+from smoothdiff._search import Search
 from smoothdiff._smooth import smooth
 from smoothdiff._smooth_first import smooth_grad, smooth_jacobian, smooth_value_and_grad
 from smoothdiff._smooth_second import smooth_hessian, smooth_hvp, smooth_quadratic
@@ -60,6 +61,7 @@ __all__ = [
     "Real",
     "Record",
     "Result",
+    "Search",
     "Sobol",
     "Uniform",
     "ZeroGrads",

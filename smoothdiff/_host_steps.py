@@ -4,6 +4,7 @@ The parts know shapes only. So they are compiled once for all functions, keys, s
 and only for those stages that a run comes to.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -32,16 +33,14 @@ class HostProblem(Problem):
         fn = _Function(self.fun)
         out = jax.eval_shape(lambda y: fn(y, self.args)[0], y)
         check(out)
-        smoothed_params(self.solver, y, jnp.asarray(0, jnp.int32), self.options)
-        return _first_state(*self._general(), y, out)
+        return self._host().init(y, out)
 
     def step(self, y: PyTree, state: PointState) -> tuple[PyTree, PointState, Bool[Array, ""]]:
         """The next evaluations, between what is compiled for the stage of the search."""
-        step, stage = self._parts(y, state), int(state.search.stage)
-        propose, searched, counted = _compiled(state.search.history.rows.size)
-        points, proposal = propose(step, stage)
+        host = self._host()
+        points, proposal = host.propose(y, state)
         rows = _rows(self._evaluator(y), points)
-        return counted(step, points, rows, searched(step, points, rows, proposal, stage))
+        return host.told(y, state, points, rows, proposal)
 
     def judge(self, y: PyTree, state: PointState) -> tuple[PyTree, dict[str, Any]]:
         """Decided on the host, so that nothing is compiled for it."""
@@ -54,11 +53,64 @@ class HostProblem(Problem):
             rows = jnp.concatenate([_rows(evaluate, part) for part in parts])
             return evaluate.funs(rows)
 
-        return self._parts(y, state).judge(values, _loop)
+        return self._host().parts(y, state).judge(values, _loop)
 
-    def _parts(self, y: PyTree, state: PointState) -> PointStep:
+    def _host(self) -> "HostSteps":
+        return HostSteps(self.solver, self.options)
+
+    def _evaluator(self, y: PyTree) -> Evaluator:
+        size = getattr(self.solver, "batch_size", None)
+        return Evaluator(_Function(self.fun), self.args, layout_of(y), self.solver.squares, size)
+
+
+@dataclasses.dataclass(frozen=True)
+class HostSteps:
+    """A solver that steps point by point, without a function."""
+
+    solver: Any
+    options: dict[str, Any]
+
+    def init(self, y: PyTree[Array], out: PyTree[jax.ShapeDtypeStruct]) -> PointState:
+        """The first state for a function that returns this, once the values were looked at."""
+        smoothed_params(self.solver, y, jnp.asarray(0, jnp.int32), self.options)
+        return _first_state(*self._general(), y, out)
+
+    def propose(
+        self, y: PyTree[Array], state: PointState, count: int | None = None
+    ) -> tuple[Float[Array, "K n"], Any]:
+        """The points of the next step, or so many of them, and what the model says of them."""
+        propose, *_ = _compiled(state)
+        return propose(self.parts(y, state, count), int(state.search.stage))
+
+    def told(
+        self,
+        y: PyTree[Array],
+        state: PointState,
+        points: Float[Array, "K n"],
+        rows: Float[Array, "K P"],
+        proposal: Any,
+    ) -> tuple[PyTree, PointState, Bool[Array, ""]]:
+        """The next iterate and state, and whether the solver wants to stop there."""
+        parts, stage = self.parts(y, state, len(points)), int(state.search.stage)
+        _, searched, counted = _compiled(state)
+        return counted(parts, points, rows, searched(parts, points, rows, proposal, stage))
+
+    def learnt(
+        self,
+        y: PyTree[Array],
+        state: PointState,
+        points: Float[Array, "K n"],
+        rows: Float[Array, "K P"],
+    ) -> PointState:
+        """The state with evaluations that it did not propose."""
+        return _learnt(self.parts(y, state), points, rows)
+
+    def parts(self, y: PyTree[Array], state: PointState, count: int | None = None) -> PointStep:
+        """The step, of so many evaluations if that is given."""
         solver, options = self._general()
-        return PointStep(solver, self.solver.sizes(y), y, options, state)
+        sizes = self.solver.sizes(y)
+        sizes = sizes if count is None else sizes._replace(step=count)
+        return PointStep(solver, sizes, y, options, state)
 
     def _general(self) -> tuple[Any, dict[str, Any]]:
         """The solver and the options, in which all that does not decide shapes is an array."""
@@ -67,10 +119,6 @@ class HostProblem(Problem):
         if "bounds" in options:
             options["bounds"] = jax.tree.map(jnp.asarray, options["bounds"])
         return eqx.tree_at(lambda s: (s.sigma, s.rtol, s.atol), solver, numbers), options
-
-    def _evaluator(self, y: PyTree) -> Evaluator:
-        size = getattr(self.solver, "batch_size", None)
-        return Evaluator(_Function(self.fun), self.args, layout_of(y), self.solver.squares, size)
 
 
 class _Function(eqx.Module):
@@ -92,6 +140,11 @@ def _first_state(solver: Any, options: dict[str, Any], y: PyTree[Array], out: Py
 @eqx.filter_jit
 def _rows(evaluate: Evaluator, points: Float[Array, "K n"]) -> Float[Array, "K P"]:
     return evaluate(points)[0]
+
+
+@eqx.filter_jit
+def _learnt(step: PointStep, points: Array, rows: Array) -> PointState:
+    return step.learnt(points, rows)
 
 
 def _propose(step: PointStep, stage: int) -> tuple[Array, Any]:
@@ -118,9 +171,10 @@ _WELL = [_jit(part) for part in _PARTS]
 _QUICKLY = [_jit(part, compiler_options={"xla_backend_optimization_level": 0}) for part in _PARTS]
 
 
-def _compiled(size: int) -> list[Callable]:
-    """The parts for a history of so many numbers."""
-    return _QUICKLY if size < _SHORT and jax.default_backend() == "cpu" else _WELL
+def _compiled(state: PointState) -> list[Callable]:
+    """The parts for a history of this size."""
+    short = state.search.history.rows.size < _SHORT
+    return _QUICKLY if short and jax.default_backend() == "cpu" else _WELL
 
 
 def _loop(more: Callable, body: Callable, state: Any) -> Any:

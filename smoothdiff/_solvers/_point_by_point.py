@@ -150,6 +150,21 @@ class PointStep(eqx.Module):
             restarts = jnp.where(least, 0, restarts)
         return new_y, PointState(progress, after, restarts)
 
+    def learnt(self, points: Float[Array, "K n"], rows: Float[Array, "K P"]) -> PointState:
+        """The state with evaluations that it did not propose."""
+        state, params = self.state, self.params()
+        progress, search = state.progress, state.search
+        funs = objectives(rows, self.solver.squares)
+        good = jnp.isfinite(funs)
+        known = jnp.where(good[:, None], rows, 0), jnp.where(good, funs, 0)
+        search = search.kept(History(points, *known, good))
+        point, fun = lowest(points, jnp.where(good, funs, jnp.inf))
+        lower, count = fun < progress.lowest_fun, len(points)
+        search = eqx.tree_at(lambda s: s.stale, search, jnp.where(lower, 0, search.stale + count))
+        seen = Seen(params.layout.tree(point), fun)
+        rest = progress.fun, progress.stderr, progress.sigma, count, progress.finite, seen
+        return PointState(progress.after(self.y, *rest), search, state.restarts)
+
     def step(self, evaluate: Evaluator) -> tuple[PyTree[Array], PointState, PyTree]:
         """The next evaluation, or as many as run at once."""
         points, proposal = self.propose()

@@ -1,0 +1,234 @@
+"""`Search`: a solver that is asked for points and told their values, wherever they come from."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from smoothdiff._default_solver import default_solver
+from smoothdiff._host_steps import HostSteps
+from smoothdiff._params import layout_of
+from smoothdiff._run import inexact
+from smoothdiff._solvers import AbstractSmoothSolver
+from smoothdiff._solvers._point_search import TRUST
+from smoothdiff._unit_space import UnitSpace
+
+# a point is given out again once so many others were told, for each that is out, and some more
+_LOST, _SOME = 2, 4
+# what is asked for beyond the step of the local model: its end nearer or further, as shares
+_SHARES = (2.0, 0.5, 4.0, 0.25)
+
+
+class Search:
+    """A search that the caller steers: `ask` for points, evaluate them anywhere, `tell` the values.
+
+    Points may be told in any order. Some may be missing, or have failed with a NaN, and more may be
+    asked for before all are told, so that no worker waits for the slowest. Values at points that
+    were never asked for teach as well, so earlier evaluations can be told at the beginning. A new
+    search with the same key that is told the same values in the same order is where the old one
+    was: to save a search, keep points and values.
+
+    What the model asks for next comes first. If that is still out, the step of the local model is
+    followed by others, nearer and further, and a round of samples by its next ones. A point that
+    nobody tells is given out again after twice as many others as are out. One at a time, these are
+    the steps of `minimise` and `least_squares`.
+
+    Args:
+        y0: where to start, a pytree of numbers and arrays.
+        key: a random key.
+        residuals: whether residuals are told for each point, of which half the sum of squares is
+            minimised, or one number.
+        solver: a `NewtonCG`, or with residuals a `GaussNewton`, for fewer than 100 parameters. The
+            default, as for `minimise`, has `nonfinite="drop"`, which failed evaluations need.
+        sigma: of the default solver, as for `minimise`.
+        space: as for `minimise`.
+        bounds: as for `minimise`.
+
+    Raises:
+        TypeError, ValueError: an argument that cannot work.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, smoothdiff as sd
+        >>> search = sd.Search(jnp.zeros(2), key=jax.random.key(0))
+        >>> for _ in range(20):
+        ...     points = search.ask(2)
+        ...     search.tell(points, [(y[0] - 1) ** 2 + (y[1] + 2) ** 2 for y in points])
+        >>> [round(float(y), 2) for y in search.y]
+        [1.0, -2.0]
+
+    Source: own.
+    """
+
+    def __init__(
+        self,
+        y0: PyTree,
+        *,
+        key: Any,
+        residuals: bool = False,
+        solver: Any = None,
+        sigma: PyTree = None,
+        space: PyTree = None,
+        bounds: tuple[PyTree, PyTree] | None = None,
+    ):
+        self._natural, unit = (lambda y: y), lambda y: y
+        if space is not None:
+            units = UnitSpace.of(y0, space)
+            self._natural, unit, bounds = units.natural, units.unit, units.bounds()
+            sigma = units.sigma() if sigma is None and solver is None else sigma
+        self._unit = lambda y: jax.tree.map(inexact, unit(y))
+        self._y = self._unit(y0)
+        if solver is None:
+            solver = default_solver(self._y, bounds, sigma, residuals)
+            solver = eqx.tree_at(lambda s: s.nonfinite, solver, "drop")
+        if not isinstance(solver, AbstractSmoothSolver) or solver.sizes(self._y) is None:
+            raise TypeError(
+                "a search evaluates point by point: give NewtonCG, or GaussNewton with residuals, "
+                "for fewer than 100 parameters and with a constant sigma"
+            )
+        if getattr(solver, "squares", None) != residuals:
+            raise TypeError(
+                f"{type(solver).__name__} is not for this: write residuals={not residuals}"
+            )
+        self.solver: Any = solver
+        self._steps = HostSteps(
+            solver, {"key": key} | ({} if bounds is None else {"bounds": bounds})
+        )
+        self._layout, self._random = layout_of(self._y), np.random.default_rng(0)
+        self._size: int | None = None
+        self._over = False
+        self._state = self._first(1)
+        # unit vectors that are out, with their natural values and how many were told before
+        self._out: dict[bytes, tuple[np.ndarray, bytes, int]] = {}
+        # rows that came, and wait for what the model asks for before them
+        self._came: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
+
+    @property
+    def y(self) -> PyTree:
+        """The lowest point of those that were told."""
+        return self._natural(self._state.progress.lowest_y)
+
+    @property
+    def fun(self) -> float:
+        """The value there, or half the sum of squares; infinite before anything was told."""
+        return self._state.progress.lowest_fun.item()
+
+    @property
+    def evaluations(self) -> int:
+        """How many values were told."""
+        return self._state.progress.evaluations.item() + len(self._came)
+
+    @property
+    def done(self) -> bool:
+        """Whether the solver would stop here; more can be asked for."""
+        return self._over
+
+    def ask(self, count: int = 1) -> list[PyTree[np.ndarray]]:
+        """The next points to evaluate, so many of them."""
+        late = self.evaluations - _SOME - _LOST * len(self._out)
+        self._out = {unit: out for unit, out in self._out.items() if out[2] > late}
+        given: list[PyTree] = []
+        for vector in self._wanted(count + len(self._out)):
+            unit = vector.tobytes()
+            if unit in self._out or unit in self._came:
+                continue
+            point = jax.device_get(self._natural(self._layout.tree(jnp.asarray(vector))))
+            self._out[unit] = vector, _bytes(point), self.evaluations
+            given.append(point)
+            if len(given) == count:
+                break
+        return given
+
+    def tell(self, points: Sequence[PyTree], values: Sequence[Any]) -> None:
+        """The values at these points; NaN for an evaluation that failed.
+
+        Raises:
+            ValueError: another number of values, or of residuals; a NaN that the solver refuses.
+        """
+        if len(points) != len(values):
+            raise ValueError(f"{len(points)} points but {len(values)} values: tell one for each")
+        rows = [self._row(value) for value in values]
+        for point, row in zip(points, rows, strict=True):
+            same = [u for u, out in self._out.items() if out[1] == _bytes(point)]
+            vectors = [self._out.pop(unit)[0] for unit in same] or [self._vector(point)]
+            for vector in vectors:
+                self._came[vector.tobytes()] = vector, row
+        while self._digested():
+            pass
+
+    def _digested(self) -> bool:
+        """Takes in what the model asks for next if that came; else what it no longer asks for."""
+        points, proposal = self._steps.propose(self._y, self._state, 1)
+        unit = np.asarray(points[0]).tobytes()
+        if unit in self._came:
+            _, row = self._came.pop(unit)
+            told = self._steps.told(self._y, self._state, points, jnp.asarray(row)[None], proposal)
+            self._y, self._state, over = told
+            self._over = bool(over)
+            return True
+        later = set()
+        if self._state.search.stage != TRUST and self._came:
+            later = {v.tobytes() for v in self._round(len(self._came) + len(self._out) + 1)}
+        for unit in [unit for unit in self._came if unit not in later]:
+            vector, row = self._came.pop(unit)
+            known = jnp.asarray(vector)[None], jnp.asarray(row)[None]
+            self._state = self._steps.learnt(self._y, self._state, *known)
+            return True
+        return False
+
+    def _wanted(self, count: int) -> Iterator[np.ndarray]:
+        """What to evaluate next, in this order, without end."""
+        search = self._state.search
+        if search.stage != TRUST:
+            yield from self._round(count)
+        else:
+            points, _ = self._steps.propose(self._y, self._state, 1)
+            end, here = np.asarray(points[0]), np.asarray(search.iterate())
+            yield end
+            yield from (self._clipped(here + share * (end - here)) for share in _SHARES)
+        params = self._steps.parts(self._y, self._state).params()
+        width = np.asarray(params.sigma * search.width())
+        while True:
+            away = width * self._random.standard_normal(width.shape)
+            yield self._clipped(np.asarray(search.iterate()) + away)
+
+    def _round(self, count: int) -> list[np.ndarray]:
+        """The next points of this round, and of no later one."""
+        # a power of two, since it is compiled for each
+        count = 1 << (count - 1).bit_length()
+        return list(np.asarray(self._steps.propose(self._y, self._state, count)[0]))
+
+    def _clipped(self, vector: np.ndarray) -> np.ndarray:
+        params = self._steps.parts(self._y, self._state).params()
+        return np.asarray(params.clip(jnp.asarray(vector, params.theta.dtype)))
+
+    def _vector(self, point: PyTree) -> np.ndarray:
+        return np.asarray(self._layout.vector(jax.tree.leaves(self._unit(point))))
+
+    def _row(self, value: Any) -> np.ndarray:
+        leaves = [np.ravel(np.asarray(leaf)) for leaf in jax.tree.leaves(value)]
+        row = np.concatenate(leaves).astype(self._layout.dtype)
+        if self._size is None and not (row.size == 1 and np.isnan(row[0])):
+            self._size = row.size
+            self._state = self._first(row.size) if row.size > 1 else self._state
+        if row.size == 1 and np.isnan(row[0]):
+            row = np.full(self._size or 1, np.nan, row.dtype)
+        if row.size != (self._size or 1) or (row.size > 1 and not self.solver.squares):
+            raise ValueError(
+                f"{row.size} numbers were told for a point, not {self._size}: tell "
+                + ("residuals of one shape" if self.solver.squares else "one number, or residuals")
+            )
+        if self.solver.nonfinite == "propagate" and not np.all(np.isfinite(row)):
+            raise ValueError('a value is not finite: give the solver nonfinite="drop"')
+        return row
+
+    def _first(self, size: int) -> Any:
+        out = jax.ShapeDtypeStruct((size,) if self.solver.squares else (), self._layout.dtype)
+        return self._steps.init(self._y, out)
+
+
+def _bytes(point: PyTree) -> bytes:
+    return b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(point))

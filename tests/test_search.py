@@ -1,0 +1,151 @@
+"""Asking and telling: the steps of the solvers, in any order, with points missing or failed."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import smoothdiff as sd
+
+KEY = jax.random.key(0)
+START = np.array([-1.2, 1.0], np.float32)
+
+
+def valley(y):
+    return np.array([10 * (y[1] - y[0] ** 2), 1 - y[0]], np.float32)
+
+
+def squares(y):
+    return np.float32(valley(y) @ valley(y))
+
+
+def evaluated(run, fun, shape, **settings):
+    """The points that a run evaluates, but for its judgement."""
+    points = []
+
+    def host(y):
+        points.append(np.array(y))
+        return fun(y)
+
+    box = sd.black_box(host, jax.ShapeDtypeStruct(shape, jnp.float32))
+    result = run(lambda y, _: box(y), START, key=KEY, **settings)
+    return points[: len(result.history)]
+
+
+@pytest.mark.parametrize(
+    ("run", "fun", "shape"), [(sd.least_squares, valley, (2,)), (sd.minimise, squares, ())]
+)
+def test_one_at_a_time_these_are_the_steps_of_the_solvers(run, fun, shape):
+    expected = evaluated(run, fun, shape, sigma=0.3, max_steps=30)
+    search = sd.Search(START, key=KEY, residuals=bool(shape), sigma=0.3)
+    for point in expected:
+        (asked,) = search.ask()
+        np.testing.assert_array_equal(asked, point)
+        search.tell([asked], [fun(asked)])
+    assert search.evaluations == len(expected)
+    assert search.fun == min(0.5 * squares(y) if shape else fun(y) for y in expected)
+
+
+@pytest.mark.parametrize("workers", [3, pytest.param(8, marks=pytest.mark.slow)])
+def test_points_come_in_any_order_or_never_or_fail(workers):
+    """Workers that take a random time; one of ten points is never told, one of ten is NaN."""
+    rng, out = np.random.default_rng(workers), []
+    search = sd.Search(START, key=KEY, residuals=True, sigma=0.3)
+    while search.fun > 1e-4 and search.evaluations < 300:
+        out += search.ask(workers - len(out))
+        point = out.pop(rng.integers(len(out)))
+        fate = rng.uniform()
+        if fate > 0.1:
+            search.tell([point], [valley(point) if fate > 0.2 else np.nan])
+    assert search.fun <= 1e-4
+    assert search.fun == pytest.approx(0.5 * squares(search.y))
+
+
+def test_what_is_asked_for_is_new():
+    search = sd.Search(START, key=KEY, sigma=0.3)
+    first = search.ask(10)
+    assert len({point.tobytes() for point in first + search.ask(5)}) == 15
+    search.tell(first[::-1], [squares(y) for y in first[::-1]])
+    assert not {point.tobytes() for point in first} & {point.tobytes() for point in search.ask(4)}
+
+
+def test_a_search_that_is_told_the_same_again_goes_on_where_it_was():
+    search, told = sd.Search(START, key=KEY, residuals=True, sigma=0.3), []
+    for _ in range(8):
+        points = search.ask(2)
+        told += [(points, [valley(y) for y in points])]
+        search.tell(*told[-1])
+    again = sd.Search(START, key=KEY, residuals=True, sigma=0.3)
+    for points, values in told:
+        again.tell(points, values)
+    np.testing.assert_array_equal(again.ask(), search.ask())
+    assert (again.fun, again.evaluations) == (search.fun, search.evaluations)
+
+
+def test_earlier_evaluations_teach():
+    rng = np.random.default_rng(0)
+    earlier = [np.float32(rng.uniform(-2, 2, 2)) for _ in range(20)]
+    search = sd.Search(START, key=KEY, residuals=True, sigma=0.3)
+    search.tell(earlier, [valley(y) for y in earlier])
+    assert search.evaluations == 20
+    assert search.fun == min(0.5 * squares(y) for y in earlier)
+    assert not search.done
+    # one that is repeated does no harm
+    search.tell(earlier[:1], [valley(earlier[0])])
+    assert np.isfinite(search.ask(3)).all()
+
+
+def test_a_space_is_asked_for_natural_values():
+    space = {"rate": sd.Range(1e-4, 1e2, log=True), "teeth": sd.Integer(3, 20)}
+    y0 = {"rate": np.float32(0.01), "teeth": 7}
+    search = sd.Search(y0, key=KEY, residuals=True, space=space)
+
+    def fun(y):
+        assert np.asarray(y["teeth"]).dtype.kind == "i"
+        return np.array([np.log(y["rate"]), 0.3 * (y["teeth"] - 12)], np.float32)
+
+    for _ in range(60):
+        points = search.ask(2)
+        search.tell(points, [fun(y) for y in points])
+    assert search.fun < 1e-3
+    assert int(search.y["teeth"]) == 12
+
+
+def test_bounds_hold():
+    bounds = (np.float32([-1.5, 0.5]), np.float32([0.5, 2.0]))
+    search = sd.Search(START, key=KEY, bounds=bounds)
+    for _ in range(15):
+        points = search.ask(4)
+        assert all(np.all((bounds[0] <= y) & (y <= bounds[1])) for y in points)
+        search.tell(points, [squares(y) for y in points])
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "match"),
+    [
+        (lambda: sd.Search(jnp.zeros(100), key=KEY), TypeError, "fewer than 100"),
+        (
+            lambda: sd.Search(START, key=KEY, solver=sd.GaussNewton(0.1)),
+            TypeError,
+            "residuals=True",
+        ),
+        (
+            lambda: sd.Search(START, key=KEY).tell([START], [1.0, 2.0]),
+            ValueError,
+            "1 points but 2 values",
+        ),
+        (
+            lambda: sd.Search(START, key=KEY).tell([START], [valley(START)]),
+            ValueError,
+            "tell one number",
+        ),
+        (
+            lambda: sd.Search(START, key=KEY, solver=sd.NewtonCG(0.1)).tell([START], [np.nan]),
+            ValueError,
+            'nonfinite="drop"',
+        ),
+    ],
+)
+def test_wrong_arguments_are_told_what_to_write(call, error, match):
+    with pytest.raises(error, match=match):
+        call()
