@@ -13,7 +13,7 @@ import smoothdiff as sd
 from benchmarks import _registry, _study
 from benchmarks._task import Task
 from benchmarks.scenes.mitsuba_scene import SAVINGS
-from benchmarks.studies import filters, overhead, savings
+from benchmarks.studies import _startup, filters, overhead, savings
 
 OPTIONS = Namespace(said="a test")
 
@@ -56,12 +56,16 @@ def test_overhead_compares_at_the_same_points():
 def test_overhead_is_drawn_and_shown(tmp_path, capsys):
     line = {"transform": "smooth_grad", "ratio": [1.0, 1.01, 1.05], "ms": 2.0}
     found = {"samples": 256, "turns": 2, "target": 1.1, "lines": [line]}
-    assert "1.01 [1, 1.05]" in shown(overhead, found, tmp_path, capsys)
+    found |= {"startup": [{"solver": "GaussNewton", "to the first step": 1.375}]}
+    text = shown(overhead, found, tmp_path, capsys)
+    assert "1.01 [1, 1.05]" in text
+    assert "1.38" in text
 
 
 @pytest.mark.slow
 def test_overhead_is_measured(monkeypatch, tmp_path):
     monkeypatch.setattr(overhead, "TURNS", 2)
+    monkeypatch.setattr(_startup, "PROCESSES", 1)
     _study.run(overhead, OPTIONS, tmp_path)
     for line in json.loads((tmp_path / "results.json").read_text())["lines"]:
         assert 0 < line["ratio"][0] <= line["ratio"][1] <= line["ratio"][2]

@@ -24,7 +24,8 @@ def records(fun, stderr):
 
 def result(fun, stderr, answer=0.5, smoothed=NAN, error=NAN):
     history = records(fun, stderr)
-    return sd.Result(jnp.zeros(2), answer, smoothed, error, 99, "converged", history)
+    numbers = answer, smoothed, error, 99
+    return sd.Result(jnp.zeros(2), *numbers, "converged", history, solver=None, state=None)
 
 
 POINTS = result([3.0, 1.0, 2.0, 0.5], [NAN] * 4)

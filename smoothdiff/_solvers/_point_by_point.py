@@ -52,7 +52,9 @@ def final_evaluations(candidates: int) -> int:
 
 def init(solver: Any, y: PyTree[Array], search: AbstractPointSearch) -> PointState:
     """The state before a search that has evaluated nothing."""
-    _normal_points(solver, jax.random.key(0), 1, search.start)
+    if solver.sampler is not None:
+        draw = lambda key: _normal_points(solver, key, 1, search.start)
+        jax.eval_shape(draw, jax.random.key(0))
     restarts = jnp.asarray(solver.restarts, jnp.int32)
     return PointState(Progress.start(y, search.start.dtype), search, restarts)
 
