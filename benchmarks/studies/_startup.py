@@ -4,6 +4,7 @@
 compiled programs stay in a process, and prints JSON.
 """
 
+import functools
 import json
 import statistics
 import subprocess
@@ -66,6 +67,7 @@ def _timed(name: str, start: jax.Array, settings: dict[str, Any]) -> tuple[float
     return steps[0], steps[points]
 
 
+@functools.cache
 def _problem(name: str, seed: int) -> tuple[Callable, Callable]:
     """Residuals from NumPy, or their squares."""
     rows = np.random.default_rng(seed).normal(size=(RESIDUALS, PARAMETERS)).astype(np.float32)
