@@ -279,10 +279,10 @@ def test_iterates_are_those_of_optimistix_but_for_rounding(precision, restarts):
         result = sd.least_squares(
             fun, y0, args, key=KEY, solver=solver, bounds=bounds, max_steps=steps
         )
-        close = {"rtol": 1e-5 if precision == "float32" else 1e-10}
-        np.testing.assert_allclose(result.y, solution.value, **close)
+        rtol = 1e-5 if precision == "float32" else 1e-10
+        np.testing.assert_allclose(result.y, solution.value, rtol=rtol)
         for name in ("fun", "smoothed", "stderr", "evaluations"):
-            np.testing.assert_allclose(getattr(result, name), solution.stats[name], **close)
+            np.testing.assert_allclose(getattr(result, name), solution.stats[name], rtol=rtol)
         # one a step, and the best point once more
         assert result.evaluations == len(result.history) + 1
 

@@ -112,7 +112,7 @@ def test_a_space_is_asked_for_natural_values():
 
 
 def test_bounds_hold():
-    bounds = (np.float32([-1.5, 0.5]), np.float32([0.5, 2.0]))
+    bounds = np.array([-1.5, 0.5], np.float32), np.array([0.5, 2.0], np.float32)
     search = sd.Search(START, key=KEY, bounds=bounds)
     for _ in range(15):
         points = search.ask(4)

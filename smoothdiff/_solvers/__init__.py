@@ -2,7 +2,9 @@
 
 A solver is an `AbstractSmoothSolver` and one of optimistix's abstract solvers, so that the same
 object runs inside `optimistix.minimise(fun, solver, y0, options={"key": key})` and, with the same
-iterates, one step at a time under `smoothdiff.minimise`. What both rely on:
+iterates, one step at a time under `smoothdiff.minimise`. What has `sizes(y)` steps point by point:
+the host then calls the function between compiled parts (`_host_steps`), and iterates are the same
+but for rounding. What both rely on:
 
 * The options are `"key"` and, optionally, `"bounds"` (`read_options`). The random numbers of a step
   come from the key, folded with counters of the state, and from nothing else.
