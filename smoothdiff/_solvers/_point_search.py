@@ -90,7 +90,7 @@ class AbstractPointSearch(eqx.Module):
 
     @abc.abstractmethod
     def over(self, sizes: Sizes) -> Bool[Array, ""]:
-        """Whether the search leads nowhere any more."""
+        """Whether the search leads nowhere any more, so that another may follow."""
 
     @abc.abstractmethod
     def smoothing(self) -> Float[Array, ""]:

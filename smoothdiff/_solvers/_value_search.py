@@ -121,9 +121,8 @@ class ValueSearch(AbstractPointSearch):
         return ~self.is_local() | self.trust.settled
 
     def over(self, sizes: Sizes) -> Bool[Array, ""]:
-        """Whether neither model leads anywhere."""
-        lost = _lost(self.center, sizes) & (self.trust.failed() | (self.searches > 0))
-        return self.converged() | lost
+        """Whether neither model leads anywhere; after one converged the wide one may yet."""
+        return _lost(self.center, sizes) & (self.trust.failed() | (self.searches > 0))
 
     def width(self) -> Float[Array, ""]:
         """The radius, or the width of the samples."""

@@ -71,7 +71,8 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
             or "drop" it.
         rtol: relative tolerance. The run has converged when three steps in a row are below
             `atol + rtol * max(norm(y), norm(sigma))`, unless only the radius made them short, or
-            they failed where the model promised more than rounding may take.
+            they failed where the model promised more than rounding may take. Where other searches
+            are to follow one goes on until its patience ends: its wide samples may find more.
         atol: absolute tolerance.
         norm: the norm of steps and iterates.
         patience: a search ends after so many evaluations in a row in which the wide model led
@@ -174,8 +175,9 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         sizes = self.sizes(y)
         if sizes is None:
             return stopped(state.progress, _newton_batches.over(self, state))
-        over = (state.restarts == 0) & state.search.over(sizes)
-        return stopped(state.progress, over, state.search.converged())
+        converged = state.search.converged()
+        over = (state.restarts == 0) & (converged | state.search.over(sizes))
+        return stopped(state.progress, over, converged)
 
     def reason(self, state: Any) -> str:
         """Small steps, a gradient that is all noise, or too many evaluations for nothing."""
