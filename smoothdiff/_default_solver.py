@@ -11,8 +11,6 @@ from jaxtyping import Array, PyTree
 
 from smoothdiff._solvers import FirstOrder, GaussNewton, LocalGaussNewton, NewtonCG
 
-# from so many parameters on a quadratic model takes too many evaluations
-_MANY = 100
 # sigma as a share of a parameter's range, or else of the largest number of its leaf
 _SHARE = 0.2
 # a step of Adam, in sigmas
@@ -50,7 +48,8 @@ def default_solver(
         sigma = jax.tree.map(lambda s, d: d if s is None else s, full, usual, is_leaf=_is_none)
     if residuals:
         return GaussNewton(sigma) if support is None else LocalGaussNewton(sigma, support)
-    if sum(leaf.size for leaf in jax.tree.leaves(y)) < _MANY:
+    # with more parameters a quadratic model takes too many evaluations
+    if NewtonCG(1.0).sizes(y) is not None:
         return NewtonCG(sigma)
     return FirstOrder(optax.chain(optax.scale_by_adam(), _in_sigmas(sigma)), sigma)
 

@@ -90,10 +90,7 @@ class PointStep(eqx.Module):
         stage: int | None = None,
     ) -> AbstractPointSearch:
         """The search with what the function returned at these points."""
-        funs = objectives(rows, self.solver.squares)
-        good = jnp.isfinite(funs)
-        rows, known = jnp.where(good[:, None], rows, 0), jnp.where(good, funs, 0)
-        new = History(points, rows, known, good)
+        new = self._new(points, rows)
         return self.state.search.after(self.params(), new, proposal, self.sizes, stage)
 
     def counted(
@@ -156,16 +153,20 @@ class PointStep(eqx.Module):
         """The state with evaluations that it did not propose."""
         state, params = self.state, self.params()
         progress, search = state.progress, state.search
-        funs = objectives(rows, self.solver.squares)
-        good = jnp.isfinite(funs)
-        known = jnp.where(good[:, None], rows, 0), jnp.where(good, funs, 0)
-        search = search.kept(History(points, *known, good))
-        point, fun = lowest(points, jnp.where(good, funs, jnp.inf))
+        new = self._new(points, rows)
+        search = search.kept(new)
+        point, fun = lowest(points, jnp.where(new.valid, new.funs, jnp.inf))
         lower, count = fun < progress.lowest_fun, len(points)
         search = eqx.tree_at(lambda s: s.stale, search, jnp.where(lower, 0, search.stale + count))
         seen = Seen(params.layout.tree(point), fun)
         rest = progress.fun, progress.stderr, progress.sigma, count, progress.finite, seen
         return PointState(progress.after(self.y, *rest), search, state.restarts)
+
+    def _new(self, points: Float[Array, "K n"], rows: Float[Array, "K P"]) -> History:
+        """These evaluations, of which those count that are finite."""
+        funs = objectives(rows, self.solver.squares)
+        good = jnp.isfinite(funs)
+        return History(points, jnp.where(good[:, None], rows, 0), jnp.where(good, funs, 0), good)
 
     def step(self, evaluate: Evaluator) -> tuple[PyTree[Array], PointState, PyTree]:
         """The next evaluation, or as many as run at once."""

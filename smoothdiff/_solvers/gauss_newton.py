@@ -83,7 +83,8 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         rtol: relative tolerance. The run has converged when three steps in a row are below
             `atol + rtol * max(norm(y), norm(sigma))`, unless only the radius made them short, or
             they failed where the model promised more than rounding may take.
-        atol: absolute tolerance.
+        atol: absolute tolerance. With both zero no run converges; else the tolerance is at least
+            the root of the rounding of `max(norm(y), norm(sigma))`.
         norm: the norm of steps and iterates.
         patience: so many evaluations in a row without a lower point end a search; by default
             20 (n + 1), and 100 if that is more and no other search is to follow. With batches it

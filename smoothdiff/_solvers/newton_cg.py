@@ -73,7 +73,8 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
             `atol + rtol * max(norm(y), norm(sigma))`, unless only the radius made them short, or
             they failed where the model promised more than rounding may take. Where other searches
             are to follow one goes on until its patience ends: its wide samples may find more.
-        atol: absolute tolerance.
+        atol: absolute tolerance. With both zero no run converges; else the tolerance is at least
+            the root of the rounding of `max(norm(y), norm(sigma))`.
         norm: the norm of steps and iterates.
         patience: a search ends after so many evaluations in a row in which the wide model led
             nowhere, if the local one does not either; by default 20 (n + 1). With batches it counts
