@@ -139,7 +139,8 @@ class PointStep(eqx.Module):
             place, other = jax.random.split(key)
             theta = _anywhere(params, place, lowest_theta)
             start = params.layout.vector(jax.tree.leaves(progress.start_y))
-            anew = after.again(params, theta, start, other)
+            lowest_fun = progress.lowest_fun.astype(theta.dtype)
+            anew = after.again(params, theta, start, (lowest_theta, lowest_fun), other)
             new_y, after = jax.tree.map(
                 lambda a, b: jnp.where(again, a, b),
                 (params.layout.tree(theta), anew),

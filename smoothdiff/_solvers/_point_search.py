@@ -12,8 +12,9 @@ from jaxtyping import Array, Bool, Float, Int
 from smoothdiff._params import Params
 from smoothdiff._solvers._history import History
 
-# what is evaluated next: the first points, a step of the local model, samples around a center
-FIRST, TRUST, WIDE = 0, 1, 2
+# what is evaluated next: the first points, a step of the local model, samples around a center, or
+# points along a parameter
+FIRST, TRUST, WIDE, SCAN = 0, 1, 2, 3
 # so many small steps in a row count as convergence
 _SMALL = 3
 # a width of so many roundings of sigma is nothing

@@ -7,6 +7,7 @@ wins where the function is rough. Whichever lowers the function faster goes on.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,8 +19,10 @@ from smoothdiff._solvers._base import all_finite
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import differ
 from smoothdiff._solvers._metric import Metric
+from smoothdiff._solvers._parameter_scan import Scan
 from smoothdiff._solvers._point_search import (
     FIRST,
+    SCAN,
     TRUST,
     WIDE,
     AbstractPointSearch,
@@ -29,44 +32,27 @@ from smoothdiff._solvers._point_search import (
 )
 from smoothdiff._solvers._quadratic_trust import Proposal, QuadraticTrust
 from smoothdiff._solvers._regression_step import Center
+from smoothdiff._solvers._turns import Turn
 
-# evaluations for each parameter, and one, of a model's first turn, and of the other's test after it
-_TURN, _TEST = 6, 4
-# the other takes over if it lowers the function at this share of the rate: the later, the less
-# there is to gain
-_SHARE = 0.3
 # of so many later searches one begins at the start
 _PATIENT = 4
 # the widths of later searches, in sigma, as powers of ten at random
 _NARROWEST, _WIDEST = -1.5, 0.3
 
 
-class Turn(eqx.Module):
-    """Whose turn it is: `spent` evaluations of `length`, from the value `before`.
-
-    In a test, `rate` is by how much the other model lowered the function for each evaluation, in a
-    turn of `usual` length.
-    """
-
-    spent: Int[Array, ""]
-    length: Int[Array, ""]
-    usual: Int[Array, ""]
-    before: Float[Array, ""]
-    rate: Float[Array, ""]
-    test: Bool[Array, ""]
-
-
 class ValueSearch(AbstractPointSearch):
     """Where a search stands, with the local model and the center of the wide samples.
 
     Those after the first, which `searches` counts, are the wide model's alone, in turns a patient
-    one at the start and some elsewhere. A patient one never goes back to the lowest sample: what is
-    lowest by chance does not lead it away from where the smoothed function is low. Nor does any
-    search where the function is `noisy`: where it gave another value for the same point, which the
-    first round of samples begins with.
+    one at the start and some elsewhere. Only the second begins with a scan of the parameters, one
+    by one, if there are bounds; what that finds is searched like the first. A patient search never
+    goes back to the lowest sample: what is lowest by chance does not lead it away from where the
+    smoothed function is low. Nor does any search where the function is `noisy`: where it gave
+    another value for the same point, which the first round of samples begins with.
     """
 
-    first_width: Float[Array, ""]
+    steps: Float[Array, " n"]
+    scan: Scan | None
     searches: Int[Array, ""]
     noisy: Bool[Array, ""]
     trust: QuadraticTrust
@@ -77,14 +63,18 @@ class ValueSearch(AbstractPointSearch):
 
     @staticmethod
     def of(
-        theta: Float[Array, " n"], sigma: Float[Array, " n"], width: Array, history: History
+        params: Params,
+        theta: Float[Array, " n"],
+        sigma: Float[Array, " n"],
+        width: Array,
+        history: History,
     ) -> "ValueSearch":
         """Nothing is known but what is in the history; the first samples are so wide."""
         none, n = jnp.zeros((), jnp.int32), len(theta)
         center = Center.start(theta, Metric.of(sigma, True))
         center = eqx.tree_at(lambda c: c.trust.width, center, width)
-        length = jnp.asarray(_TURN * (n + 1), jnp.int32)
         never = jnp.zeros_like(width)
+        bounded = params.low is not None and params.high is not None
         return ValueSearch(
             stage=jnp.asarray(FIRST, jnp.int32),
             history=history,
@@ -92,27 +82,45 @@ class ValueSearch(AbstractPointSearch):
             evaluated=none,
             small=none,
             stale=none,
-            first_width=width,
+            steps=width * sigma,
+            scan=Scan.start(theta, never, sigma) if bounded else None,
             searches=none,
             noisy=jnp.asarray(False),
             trust=QuadraticTrust.start(sigma, width),
             center=center,
             taken=none,
             rounds=none,
-            turn=Turn(none, length, length, never, never, jnp.asarray(False)),
+            turn=Turn.start(n, never),
         )
 
     def again(
-        self, params: Params, theta: Float[Array, " n"], start: Float[Array, " n"], key: Array
+        self,
+        params: Params,
+        theta: Float[Array, " n"],
+        start: Float[Array, " n"],
+        lowest: tuple[Float[Array, " n"], Float[Array, ""]],
+        key: Array,
     ) -> "ValueSearch":
-        """Another search: in turns a patient one at the start, and some elsewhere of any width."""
+        """Another search: in turns a patient one at the start, and some elsewhere of any width.
+
+        The second scans the parameters one by one, if they have bounds.
+        """
         empty = jax.tree.map(jnp.zeros_like, self.history)
         searches = self.searches + 1
-        here = _patient(searches)
+        here = self._patient(searches)
         power = jax.random.uniform(key, (), theta.dtype, _NARROWEST, _WIDEST)
         theta, width = jnp.where(here, start, theta), jnp.where(here, 1, 10**power)
-        anew = ValueSearch.of(theta, params.sigma, width, empty)
+        anew = ValueSearch.of(params, theta, params.sigma, width, empty)
         stage = jnp.full_like(self.stage, WIDE)
+        if anew.scan is not None:
+            # where parameters act alone, a longer scan is the best that can follow
+            scan, longer = Scan.start(*lowest, params.sigma), self.scan.again(*lowest)
+            more = self.scan.done() & ~longer.failed
+            scan = _where(more, longer, scan)
+            anew = eqx.tree_at(lambda s: s.scan, anew, scan)
+            finite = jnp.all(jnp.isfinite(params.low) & jnp.isfinite(params.high))
+            scans = (more | (searches == 1)) & finite
+            stage = jnp.where(scans, SCAN, stage).astype(stage.dtype)
         changed = stage, self.rounds + 1, searches, self.noisy
         return eqx.tree_at(lambda s: (s.stage, s.rounds, s.searches, s.noisy), anew, changed)
 
@@ -122,7 +130,17 @@ class ValueSearch(AbstractPointSearch):
 
     def over(self, sizes: Sizes) -> Bool[Array, ""]:
         """Whether neither model leads anywhere; after one converged the wide one may yet."""
-        return _lost(self.center, sizes) & (self.trust.failed() | (self.searches > 0))
+        lost = _lost(self.center, sizes) & (self.trust.failed() | self._later())
+        return lost if self.scan is None else lost | self.scan.failed
+
+    def _patient(self, searches: Int[Array, ""]) -> Bool[Array, ""]:
+        """Whether the search with this number is a patient one; a scan comes before them all."""
+        return searches % _PATIENT == (1 if self.scan is None else 2)
+
+    def _later(self) -> Bool[Array, ""]:
+        """Whether there are wide samples alone."""
+        scanned = jnp.asarray(False) if self.scan is None else self.scan.done()
+        return (self.searches > 0) & ~scanned
 
     def width(self) -> Float[Array, ""]:
         """The radius, or the width of the samples."""
@@ -164,7 +182,7 @@ class ValueSearch(AbstractPointSearch):
             if count > 1:
                 table = jnp.concatenate([table, draw(count)])
             at = jnp.minimum(self.evaluated + slot, len(table) - 1)
-            return self.start[None] + self.first_width * params.sigma[None] * table[at], nothing
+            return self.start[None] + self.steps[None] * table[at], nothing
 
         def local() -> tuple[Array, Proposal]:
             center, _, fun = self.history.best(self.start)
@@ -177,7 +195,10 @@ class ValueSearch(AbstractPointSearch):
             best, *_ = self.history.best(self.start)
             return points.at[0].set(jnp.where(self._checks(), best, points[0])), nothing
 
-        return by_stage(self.stage, stage, [first, local, wide])
+        def scan() -> tuple[Array, Proposal]:
+            return self.scan.propose(params, count), nothing
+
+        return by_stage(self.stage, stage, [first, local, wide, *([scan] if self.scan else [])])
 
     def after(
         self,
@@ -190,15 +211,13 @@ class ValueSearch(AbstractPointSearch):
         """The search with these new evaluations."""
         before = self.history.best(self.start)[2]
         known = self.kept(new)
-        known = eqx.tree_at(lambda s: s.turn.spent, known, self.turn.spent + sizes.step)
+        known = eqx.tree_at(lambda s: s.turn, known, self.turn.more(sizes.step))
 
         def first() -> "ValueSearch":
             enough = self.evaluated + sizes.step > 2 * len(self.start)
             stage = jnp.where(enough, TRUST, FIRST).astype(self.stage.dtype)
-            turn = jnp.zeros_like(self.turn.spent), known.history.best(self.start)[2]
-            return eqx.tree_at(
-                lambda s: (s.stage, s.turn.spent, s.turn.before), known, (stage, *turn)
-            )
+            turn = Turn.start(len(self.start), known.history.best(self.start)[2])
+            return eqx.tree_at(lambda s: (s.stage, s.turn), known, (stage, turn))
 
         def local() -> "ValueSearch":
             trust = self.trust.revise(proposal, before, new.funs, new.valid)
@@ -211,7 +230,20 @@ class ValueSearch(AbstractPointSearch):
             full = lambda: more._stepped(params)._turned(sizes)
             return jax.lax.cond(taken >= sizes.first, full, lambda: more)
 
-        return by_stage(self.stage, stage, [first, local, wide])
+        def scan() -> "ValueSearch":
+            scan = self.scan.after(new.points, jnp.where(new.valid, new.funs, jnp.inf))
+            # the best places of all parameters together are where a search begins
+            one = jnp.ones_like(scan.fun)
+            anew = ValueSearch.of(params, scan.found, scan.nearest, one, known.history)
+            none = jnp.full_like(self.evaluated, -sizes.step)
+            changed = self.searches, self.rounds, self.noisy, scan, none
+            anew = eqx.tree_at(
+                lambda s: (s.searches, s.rounds, s.noisy, s.scan, s.evaluated), anew, changed
+            )
+            on = eqx.tree_at(lambda s: s.scan, known, scan)
+            return _where(scan.done(), anew, on)
+
+        return by_stage(self.stage, stage, [first, local, wide, *([scan] if self.scan else [])])
 
     def _checks(self) -> Bool[Array, ""]:
         """Whether a point is evaluated again that was evaluated before."""
@@ -219,13 +251,13 @@ class ValueSearch(AbstractPointSearch):
 
     def _stepped(self, params: Params) -> "ValueSearch":
         """The next center, from all samples."""
-        history, returns = self.history, ~_patient(self.searches) & ~self.noisy
+        history, returns = self.history, ~self._patient(self.searches) & ~self.noisy
         center, *_ = self.center.stepped(
             params, history.points, history.funs, history.valid, True, returns
         )
         # a metric can overflow where the function is flat
         finite = all_finite((center.theta, center.metric, center.trust.width))
-        center = jax.tree.map(lambda a, b: jnp.where(finite, a, b), center, self.center)
+        center = _where(finite, center, self.center)
         none = jnp.zeros_like(self.taken)
         new = center, none, self.rounds + 1
         return eqx.tree_at(lambda s: (s.center, s.taken, s.rounds), self, new)
@@ -234,58 +266,30 @@ class ValueSearch(AbstractPointSearch):
         """The other model's turn, if this one's is over."""
         turn, local = self.turn, self.is_local()
         point, _, fun = self.history.best(self.start)
-        rate = (turn.before - fun) / jnp.maximum(turn.spent, 1).astype(fun.dtype)
-        lower = rate > 0
+        lower, little = turn.lowered(fun)
         stuck = local & self.trust.stuck()
-        ended = (turn.spent >= turn.length) | stuck
-        ended |= ~local & _lost(self.center, sizes)
-        ended &= self.searches == 0
+        ended = turn.over() | stuck | (~local & _lost(self.center, sizes))
+        ended &= ~self._later()
 
         # what one has found the other begins with, unless it found little
-        little = turn.test & (rate <= _SHARE * turn.rate)
         revive = ~local & lower & self.trust.stuck()
-        trust = jax.tree.map(
-            lambda a, b: jnp.where(revive, a, b),
-            self.trust.revived(self.center.trust.width),
-            self.trust,
-        )
-        trust = jax.tree.map(lambda a, b: jnp.where(local, a, b), trust, trust.retried())
+        revived = self.trust.revived(self.center.trust.width)
+        trust = _where(revive, revived, self.trust)
+        trust = _where(local, trust, trust.retried())
         move = local & ((lower & ~little) | (self.rounds == 0))
-        center = jax.tree.map(
-            lambda a, b: jnp.where(move, a, b), self.center.moved(point), self.center
-        )
-        done = jnp.stack([trust.failed(), _lost(center, sizes)])
-        here = jnp.where(local, 0, 1)
-        other = 1 - here
-        wins = turn.test & (~little | done[other]) & ~stuck
-        stays = wins & ~done[here]
-        first = jnp.full_like(turn.usual, _TURN * (len(self.start) + 1))
-        usual = jnp.where(turn.test, jnp.where(wins, first, 2 * turn.usual), turn.usual)
-        follows = jnp.where(stays, here, other)
-        skipped = done[follows]
-        follows = jnp.where(skipped, 1 - follows, follows)
-        # a local model that does not predict has lost, without a test of the other
-        test = ~turn.test & ~skipped & ~stuck
-        usual = jnp.where(skipped, first, usual)
-        short = jnp.full_like(usual, _TEST * (len(self.start) + 1))
-        after = Turn(
-            spent=jnp.zeros_like(turn.spent),
-            length=jnp.where(test, short, usual),
-            usual=usual,
-            before=fun,
-            rate=rate,
-            test=test,
-        )
-        stage = jnp.where(follows == 0, TRUST, WIDE).astype(self.stage.dtype)
+        center = _where(move, self.center.moved(point), self.center)
+        done = trust.failed(), _lost(center, sizes)
+        ours, theirs = jnp.where(local, *done), jnp.where(local, *done[::-1])
+        after, other = turn.next(fun, len(self.start), (ours, theirs), stuck)
+        stage = jnp.where(local == other, WIDE, TRUST).astype(self.stage.dtype)
         turned = eqx.tree_at(
             lambda s: (s.stage, s.trust, s.center, s.turn), self, (stage, trust, center, after)
         )
-        return jax.tree.map(lambda a, b: jnp.where(ended, a, b), turned, self)
+        return _where(ended, turned, self)
 
 
-def _patient(searches: Int[Array, ""]) -> Bool[Array, ""]:
-    """Whether the search with this number is a patient one."""
-    return searches % _PATIENT == 1
+def _where(condition: Bool[Array, ""], a: Any, b: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), a, b)
 
 
 def _lost(center: Center, sizes: Sizes) -> Bool[Array, ""]:

@@ -79,10 +79,12 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         patience: a search ends after so many evaluations in a row in which the wide model led
             nowhere, if the local one does not either; by default 20 (n + 1). With batches it counts
             steps, by default 30.
-        restarts: how many searches may follow, with wide samples alone: for functions with several
-            minima. One of four begins at the first point, the others anywhere within the bounds,
-            without bounds around the best point so far, as wide as chance has it. With batches all
-            begin at the first point. The best point of all is returned.
+        restarts: how many searches may follow: for functions with several minima. The first of them
+            tries each parameter alone, from bound to bound, and ends after 33 evaluations unless
+            the parameters act independently. All others are of wide samples alone: one of four
+            begins at the first point, the others anywhere within the bounds, without bounds around
+            the best point so far, as wide as chance has it. With batches all begin at the first
+            point. The best point of all is returned.
 
     Raises:
         ValueError: no evaluation in a step, fewer kept ones than two, a patience of none, negative
@@ -102,7 +104,8 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
 
     Source: Stochastic Gradient Estimation for Higher-order Differentiable Rendering, section 4, for
     Newton-CG on sampled derivatives; Steihaug 1983 for the inner solver; Sun and Nocedal 2023 for
-    the relaxed test; Powell 2004 for the local model.
+    the relaxed test; Powell 2004 for the local model; Langerman, Seront and Bersini 1994 (STEP) for
+    the search along one parameter.
     """
 
     squares: ClassVar[bool] = False
@@ -160,7 +163,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         length = max(self.history or usual, sizes.first, n + 2)
         history = History.empty(length, n, 1, theta.dtype)
         width = jnp.ones((), theta.dtype)
-        search = ValueSearch.of(theta, params.sigma, width, history)
+        search = ValueSearch.of(params, theta, params.sigma, width, history)
         return _point_by_point.init(self, y, search)
 
     def step(self, fn, y, args, options, state, tags):

@@ -1,0 +1,102 @@
+"""The scan of parameters one by one: finds global minima, and knows where it does not apply."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import smoothdiff as sd
+from smoothdiff._params import take_apart
+from smoothdiff._solvers._parameter_scan import Scan
+
+LOW, HIGH = -5.0, 5.0
+BEST = jnp.array([1.3, -2.1, 0.4])
+
+
+def rastrigin(y, turn=None):
+    """About ten minima along each axis, and one global one at BEST."""
+    z = y - BEST if turn is None else turn @ (y - BEST)
+    return jnp.sum(z**2 + 10 * (1 - jnp.cos(2 * jnp.pi * z)))
+
+
+def scanned(fun, base, count):
+    """The scan until it is done or has failed, and how many evaluations it took."""
+    params = take_apart(base, 1.0, (LOW, HIGH))
+
+    def step(carry):
+        scan, spent = carry
+        points = scan.propose(params, count)
+        return scan.after(points, jax.vmap(fun)(points)), spent + count
+
+    more = lambda carry: ~(carry[0].done() | carry[0].failed)
+    first = Scan.start(base, fun(base), jnp.ones_like(base)), 0
+    return jax.jit(lambda: jax.lax.while_loop(more, step, first))()
+
+
+@pytest.mark.parametrize("count", [1, 4])
+def test_independent_parameters_are_found_one_by_one(count):
+    base = jnp.array([-4.0, 3.3, 4.8])
+    scan, spent = scanned(rastrigin, base, count)
+    assert scan.done()
+    assert not scan.failed
+    # in the basin of the global minimum, whose neighbours are a unit away
+    np.testing.assert_allclose(scan.found, BEST, atol=0.3)
+    # two tries of 16, their test, and 50 for each parameter, in whole steps
+    assert spent <= 2 * (16 + count) + count + 3 * (50 + count)
+    assert np.all(scan.nearest > 0)
+
+
+def test_parameters_that_act_together_end_the_scan_early():
+    turn, _ = jnp.linalg.qr(jax.random.normal(jax.random.key(0), (3, 3)))
+    scan, spent = scanned(lambda y: rastrigin(y, turn), jnp.array([-4.0, 3.3, 4.8]), 1)
+    assert scan.failed
+    assert spent == 33
+
+
+def test_nothing_lower_ends_the_scan():
+    scan, _ = scanned(lambda y: jnp.sum((y - BEST) ** 2), BEST, 1)
+    assert scan.failed
+
+
+def test_infinite_values_are_no_trouble():
+    holed = lambda y: jnp.where(jnp.abs(y[0] + 3) < 0.5, jnp.inf, jnp.sum((y - BEST) ** 2))
+    scan, _ = scanned(holed, jnp.array([4.0, 4.0, 4.0]), 1)
+    assert scan.done()
+    np.testing.assert_allclose(scan.found, BEST, atol=0.3)
+
+
+def test_a_longer_scan_follows():
+    scan = Scan.start(BEST, jnp.asarray(1.0), jnp.ones(3)).again(BEST, jnp.asarray(1.0))
+    limits = []
+    while not scan.failed:
+        limits.append(int(scan.limit))
+        scan = scan.again(BEST, jnp.asarray(1.0))
+    assert limits == [50, 100, 200]
+
+
+def solved(seed, bounds, max_evaluations):
+    key = jax.random.key(seed)
+    start = jax.random.uniform(key, (3,), minval=-4, maxval=4)
+    return sd.minimise(
+        lambda y, args: rastrigin(y),
+        start,
+        key=key,
+        solver=sd.NewtonCG(1.0, restarts=10),
+        bounds=bounds,
+        max_evaluations=max_evaluations,
+    )
+
+
+def test_a_solver_scans_where_its_first_search_is_over():
+    assert solved(0, (LOW, HIGH), 600).fun < 1e-3
+
+
+def test_open_sides_are_not_scanned():
+    assert np.isfinite(solved(0, (-jnp.inf, HIGH), 300).fun)
+
+
+@pytest.mark.slow
+def test_a_solver_with_restarts_finds_the_global_minimum():
+    found = np.array([solved(seed, (LOW, HIGH), 900).fun for seed in range(8)])
+    # a first scan may miss a basin that is a tenth of the line
+    assert np.sum(found < 1e-3) >= 6
