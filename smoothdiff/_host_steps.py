@@ -4,7 +4,6 @@ The parts know shapes only. So they are compiled once for all functions, keys, s
 and only for those stages that a run comes to.
 """
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -18,7 +17,7 @@ from smoothdiff._run import Problem
 from smoothdiff._solvers._base import smoothed_params
 from smoothdiff._solvers._evaluator import Evaluator
 from smoothdiff._solvers._point_by_point import PointState, PointStep
-from smoothdiff._solvers._point_search import AbstractPointSearch
+from smoothdiff._solvers._point_search import AbstractPointSearch, Sizes
 
 # with a history of fewer numbers a step is short, and compiling it well would take longer than all
 # of the steps
@@ -28,23 +27,31 @@ _SHORT = 1_000_000
 class HostProblem(Problem):
     """A problem whose solver steps point by point."""
 
+    host: "HostSteps"
+
+    @staticmethod
+    def of(
+        fun: Callable, solver: Any, args: PyTree, options: dict[str, Any], y: PyTree
+    ) -> "HostProblem":
+        """For parameters like `y`, once the values of the solver were looked at."""
+        return HostProblem(fun, solver, args, options, HostSteps.of(solver, options, y))
+
     def init(self, y: PyTree, check: Callable[[PyTree], None]) -> PointState:
-        """As for any problem, compiled for shapes once the values were looked at."""
+        """As for any problem, compiled for shapes."""
         fn = _Function(self.fun)
         out = jax.eval_shape(lambda y: fn(y, self.args)[0], y)
         check(out)
-        return self._host().init(y, out)
+        return self.host.init(y, out)
 
     def step(self, y: PyTree, state: PointState) -> tuple[PyTree, PointState, Bool[Array, ""]]:
         """The next evaluations, between what is compiled for the stage of the search."""
-        host = self._host()
-        points, proposal = host.propose(y, state)
+        points, proposal = self.host.propose(y, state)
         rows = _rows(self._evaluator(y), points)
-        return host.told(y, state, points, rows, proposal)
+        return self.host.told(y, state, points, rows, proposal)
 
     def judge(self, y: PyTree, state: PointState) -> tuple[PyTree, dict[str, Any]]:
         """Decided on the host, so that nothing is compiled for it."""
-        evaluate, at_once = self._evaluator(y), self.solver.sizes(y).step
+        evaluate, at_once = self._evaluator(y), self.host.sizes.step
 
         # as many at once as in a step, by the program that evaluated them before
         def values(points: PyTree[Array]) -> Array:
@@ -53,27 +60,41 @@ class HostProblem(Problem):
             rows = jnp.concatenate([_rows(evaluate, part) for part in parts])
             return evaluate.funs(rows)
 
-        return self._host().parts(y, state).judge(values, _loop)
-
-    def _host(self) -> "HostSteps":
-        return HostSteps(self.solver, self.options)
+        return self.host.parts(y, state).judge(values, _loop)
 
     def _evaluator(self, y: PyTree) -> Evaluator:
         size = getattr(self.solver, "batch_size", None)
         return Evaluator(_Function(self.fun), self.args, layout_of(y), self.solver.squares, size)
 
 
-@dataclasses.dataclass(frozen=True)
-class HostSteps:
-    """A solver that steps point by point, without a function."""
+class HostSteps(eqx.Module):
+    """A solver that steps point by point, without a function.
+
+    In the solver and the options all that does not decide shapes is an array.
+    """
 
     solver: Any
     options: dict[str, Any]
+    sizes: Sizes = eqx.field(static=True)
+
+    @staticmethod
+    def of(solver: Any, options: dict[str, Any], y: PyTree[Array]) -> "HostSteps":
+        """For parameters like `y`.
+
+        Raises:
+            ValueError: a sigma, bounds or options that cannot work.
+        """
+        smoothed_params(solver, y, jnp.asarray(0, jnp.int32), options)
+        numbers = jax.tree.map(jnp.asarray, (solver.sigma, solver.rtol, solver.atol))
+        general = eqx.tree_at(lambda s: (s.sigma, s.rtol, s.atol), solver, numbers)
+        options = dict(options)
+        if "bounds" in options:
+            options["bounds"] = jax.tree.map(jnp.asarray, options["bounds"])
+        return HostSteps(general, options, solver.sizes(y))
 
     def init(self, y: PyTree[Array], out: PyTree[jax.ShapeDtypeStruct]) -> PointState:
-        """The first state for a function that returns this, once the values were looked at."""
-        smoothed_params(self.solver, y, jnp.asarray(0, jnp.int32), self.options)
-        return _first_state(*self._general(), y, out)
+        """The first state for a function that returns this."""
+        return _first_state(self.solver, self.options, y, out)
 
     def propose(
         self, y: PyTree[Array], state: PointState, count: int | None = None
@@ -107,18 +128,8 @@ class HostSteps:
 
     def parts(self, y: PyTree[Array], state: PointState, count: int | None = None) -> PointStep:
         """The step, of so many evaluations if that is given."""
-        solver, options = self._general()
-        sizes = self.solver.sizes(y)
-        sizes = sizes if count is None else sizes._replace(step=count)
-        return PointStep(solver, sizes, y, options, state)
-
-    def _general(self) -> tuple[Any, dict[str, Any]]:
-        """The solver and the options, in which all that does not decide shapes is an array."""
-        solver, options = self.solver, dict(self.options)
-        numbers = jax.tree.map(jnp.asarray, (solver.sigma, solver.rtol, solver.atol))
-        if "bounds" in options:
-            options["bounds"] = jax.tree.map(jnp.asarray, options["bounds"])
-        return eqx.tree_at(lambda s: (s.sigma, s.rtol, s.atol), solver, numbers), options
+        sizes = self.sizes if count is None else self.sizes._replace(step=count)
+        return PointStep(self.solver, sizes, y, self.options, state)
 
 
 class _Function(eqx.Module):

@@ -211,8 +211,11 @@ def _run(
         check_solver(solver, interface, example, sigma, support)
     options = {"key": key} if bounds is None else {"key": key, "bounds": bounds}
     ends = Limits.of(solver, y, *limits)
-    problem = (Problem if solver.sizes(y) is None else HostProblem)(fun, solver, args, options)
     with explained():
+        if solver.sizes(y) is None:
+            problem = Problem(fun, solver, args, options)
+        else:
+            problem = HostProblem.of(fun, solver, args, options, y)
         state = _first_state(problem, y, check)
     run = Run(problem, y, state, natural)
     if checkpoint is not None:

@@ -94,9 +94,8 @@ class Search:
                 f"{type(solver).__name__} is not for this: write residuals={not residuals}"
             )
         self.solver: Any = solver
-        self._steps = HostSteps(
-            solver, {"key": key} | ({} if bounds is None else {"bounds": bounds})
-        )
+        options = {"key": key} | ({} if bounds is None else {"bounds": bounds})
+        self._steps = HostSteps.of(solver, options, self._y)
         self._layout, self._random = layout_of(self._y), np.random.default_rng(0)
         self._size: int | None = None
         self._over = False

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import smoothdiff as sd
-from smoothdiff._params import take_apart
 from smoothdiff._solvers._parameter_scan import Scan
 
 LOW, HIGH = -5.0, 5.0
@@ -21,11 +20,11 @@ def rastrigin(y, turn=None):
 
 def scanned(fun, base, count):
     """The scan until it is done or has failed, and how many evaluations it took."""
-    params = take_apart(base, 1.0, (LOW, HIGH))
+    low, high = jnp.full_like(base, LOW), jnp.full_like(base, HIGH)
 
     def step(carry):
         scan, spent = carry
-        points = scan.propose(params, count)
+        points = scan.propose(low, high, count)
         return scan.after(points, jax.vmap(fun)(points)), spent + count
 
     more = lambda carry: ~(carry[0].done() | carry[0].failed)

@@ -23,6 +23,18 @@ _LOWER = 0.01
 _OFF = 0.1
 
 
+def bounded(params: Params) -> bool:
+    """Whether there are bounds to both sides, open or not."""
+    return params.low is not None and params.high is not None
+
+
+def bounds_of(params: Params) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Those of parameters that are `bounded`."""
+    if params.low is None or params.high is None:
+        raise ValueError("a scan goes from bound to bound: give bounds")
+    return params.low, params.high
+
+
 class Scan(eqx.Module):
     """Evaluations along a parameter through `base`: `taken` of `limit`, `funs` at `places`.
 
@@ -60,12 +72,14 @@ class Scan(eqx.Module):
         changed = limit, jnp.asarray(True), limit > _MOST
         return eqx.tree_at(lambda s: (s.limit, s.tried, s.failed), anew, changed)
 
-    def propose(self, params: Params, count: int) -> Float[Array, "K n"]:
+    def propose(
+        self, low: Float[Array, " n"], high: Float[Array, " n"], count: int
+    ) -> Float[Array, "K n"]:
         """So many points along the parameter, its bounds first, or both best places together."""
         n = len(self.base)
         at = jnp.minimum(self.line, n - 1)
         slot = self.taken + jnp.arange(count)
-        places = jnp.where(slot == 0, params.low[at], params.high[at])
+        places = jnp.where(slot == 0, low[at], high[at])
         places = jnp.where(slot < 2, places, self._easiest(count))
         line = jnp.broadcast_to(self.base, (count, n)).at[:, at].set(places)
         return jnp.where(self.tests, self.found[None], line)
@@ -84,7 +98,7 @@ class Scan(eqx.Module):
         # the root of the inverse of the curvature
         ease = jnp.where(known[1:] & known[:-1], length / (above[1:] + above[:-1]), 0)
         _, best = jax.lax.top_k(ease, min(count, len(ease)))
-        best = jnp.resize(best, count)
+        best = jnp.resize(best, (count,))
         middles = (places[best] + places[best + 1]) / 2
         return jnp.where(jnp.isfinite(middles), middles, self.base[0])
 

@@ -49,9 +49,17 @@ class AbstractPointSearch(eqx.Module):
 
     @abc.abstractmethod
     def again(
-        self, params: Params, theta: Float[Array, " n"], start: Float[Array, " n"], key: Array
+        self,
+        params: Params,
+        theta: Float[Array, " n"],
+        start: Float[Array, " n"],
+        lowest: tuple[Float[Array, " n"], Float[Array, ""]],
+        key: Array,
     ) -> "AbstractPointSearch":
-        """Another search, from elsewhere or from where the run began, with other random numbers."""
+        """Another search, from elsewhere, from where the run began or through the lowest point.
+
+        It has other random numbers.
+        """
 
     @abc.abstractmethod
     def width(self) -> Float[Array, "..."]:

@@ -61,7 +61,12 @@ class ResidualSearch(AbstractPointSearch):
         )
 
     def again(
-        self, params: Params, theta: Float[Array, " n"], start: Float[Array, " n"], key: Array
+        self,
+        params: Params,
+        theta: Float[Array, " n"],
+        start: Float[Array, " n"],
+        lowest: tuple[Float[Array, " n"], Float[Array, ""]],
+        key: Array,
     ) -> "ResidualSearch":
         """Another search, from elsewhere, with other random numbers."""
         empty = jax.tree.map(jnp.zeros_like, self.history)

@@ -19,7 +19,7 @@ from smoothdiff._solvers._base import all_finite
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import differ
 from smoothdiff._solvers._metric import Metric
-from smoothdiff._solvers._parameter_scan import Scan
+from smoothdiff._solvers._parameter_scan import Scan, bounded, bounds_of
 from smoothdiff._solvers._point_search import (
     FIRST,
     SCAN,
@@ -74,7 +74,6 @@ class ValueSearch(AbstractPointSearch):
         center = Center.start(theta, Metric.of(sigma, True))
         center = eqx.tree_at(lambda c: c.trust.width, center, width)
         never = jnp.zeros_like(width)
-        bounded = params.low is not None and params.high is not None
         return ValueSearch(
             stage=jnp.asarray(FIRST, jnp.int32),
             history=history,
@@ -83,7 +82,7 @@ class ValueSearch(AbstractPointSearch):
             small=none,
             stale=none,
             steps=width * sigma,
-            scan=Scan.start(theta, never, sigma) if bounded else None,
+            scan=Scan.start(theta, never, sigma) if bounded(params) else None,
             searches=none,
             noisy=jnp.asarray(False),
             trust=QuadraticTrust.start(sigma, width),
@@ -112,14 +111,13 @@ class ValueSearch(AbstractPointSearch):
         theta, width = jnp.where(here, start, theta), jnp.where(here, 1, 10**power)
         anew = ValueSearch.of(params, theta, params.sigma, width, empty)
         stage = jnp.full_like(self.stage, WIDE)
-        if anew.scan is not None:
+        if self.scan is not None:
             # where parameters act alone, a longer scan is the best that can follow
             scan, longer = Scan.start(*lowest, params.sigma), self.scan.again(*lowest)
             more = self.scan.done() & ~longer.failed
-            scan = _where(more, longer, scan)
-            anew = eqx.tree_at(lambda s: s.scan, anew, scan)
-            finite = jnp.all(jnp.isfinite(params.low) & jnp.isfinite(params.high))
-            scans = (more | (searches == 1)) & finite
+            anew = eqx.tree_at(lambda s: s.scan, anew, _where(more, longer, scan))
+            closed = jnp.all(jnp.isfinite(jnp.stack(bounds_of(params))))
+            scans = (more | (searches == 1)) & closed
             stage = jnp.where(scans, SCAN, stage).astype(stage.dtype)
         changed = stage, self.rounds + 1, searches, self.noisy
         return eqx.tree_at(lambda s: (s.stage, s.rounds, s.searches, s.noisy), anew, changed)
@@ -195,10 +193,10 @@ class ValueSearch(AbstractPointSearch):
             best, *_ = self.history.best(self.start)
             return points.at[0].set(jnp.where(self._checks(), best, points[0])), nothing
 
-        def scan() -> tuple[Array, Proposal]:
-            return self.scan.propose(params, count), nothing
-
-        return by_stage(self.stage, stage, [first, local, wide, *([scan] if self.scan else [])])
+        branches = [first, local, wide]
+        if (scan := self.scan) is not None:
+            branches.append(lambda: (scan.propose(*bounds_of(params), count), nothing))
+        return by_stage(self.stage, stage, branches)
 
     def after(
         self,
@@ -230,20 +228,22 @@ class ValueSearch(AbstractPointSearch):
             full = lambda: more._stepped(params)._turned(sizes)
             return jax.lax.cond(taken >= sizes.first, full, lambda: more)
 
-        def scan() -> "ValueSearch":
-            scan = self.scan.after(new.points, jnp.where(new.valid, new.funs, jnp.inf))
-            # the best places of all parameters together are where a search begins
-            one = jnp.ones_like(scan.fun)
-            anew = ValueSearch.of(params, scan.found, scan.nearest, one, known.history)
-            none = jnp.full_like(self.evaluated, -sizes.step)
-            changed = self.searches, self.rounds, self.noisy, scan, none
-            anew = eqx.tree_at(
-                lambda s: (s.searches, s.rounds, s.noisy, s.scan, s.evaluated), anew, changed
-            )
-            on = eqx.tree_at(lambda s: s.scan, known, scan)
-            return _where(scan.done(), anew, on)
+        branches = [first, local, wide]
+        if (scan := self.scan) is not None:
+            funs = jnp.where(new.valid, new.funs, jnp.inf)
+            branches.append(lambda: known._scanned(params, scan.after(new.points, funs), sizes))
+        return by_stage(self.stage, stage, branches)
 
-        return by_stage(self.stage, stage, [first, local, wide, *([scan] if self.scan else [])])
+    def _scanned(self, params: Params, scan: Scan, sizes: Sizes) -> "ValueSearch":
+        """With this scan; the best places of all parameters together are where a search begins."""
+        one = jnp.ones_like(scan.fun)
+        anew = ValueSearch.of(params, scan.found, scan.nearest, one, self.history)
+        none = jnp.full_like(self.evaluated, -sizes.step)
+        kept = self.searches, self.rounds, self.noisy, scan, none
+        anew = eqx.tree_at(
+            lambda s: (s.searches, s.rounds, s.noisy, s.scan, s.evaluated), anew, kept
+        )
+        return _where(scan.done(), anew, eqx.tree_at(lambda s: s.scan, self, scan))
 
     def _checks(self) -> Bool[Array, ""]:
         """Whether a point is evaluated again that was evaluated before."""
@@ -279,7 +279,7 @@ class ValueSearch(AbstractPointSearch):
         move = local & ((lower & ~little) | (self.rounds == 0))
         center = _where(move, self.center.moved(point), self.center)
         done = trust.failed(), _lost(center, sizes)
-        ours, theirs = jnp.where(local, *done), jnp.where(local, *done[::-1])
+        ours, theirs = _where(local, *done), _where(local, *done[::-1])
         after, other = turn.next(fun, len(self.start), (ours, theirs), stuck)
         stage = jnp.where(local == other, WIDE, TRUST).astype(self.stage.dtype)
         turned = eqx.tree_at(
