@@ -2,12 +2,12 @@
 
 import os
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import optimistix as optx
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 from tqdm import tqdm
 
 from smoothdiff._black_box import UnknownOutputError
@@ -26,6 +26,9 @@ from smoothdiff._result import MinimiseError, Record, Result
 from smoothdiff._run import Problem, Run, inexact
 from smoothdiff._unit_space import UnitSpace
 
+# from so many parameters on, the history does without iterates unless it is asked for them
+_MANY = 10_000
+
 
 def minimise(
     fun: Callable[[PyTree, PyTree], Any],
@@ -43,6 +46,7 @@ def minimise(
     bounds: tuple[PyTree, PyTree] | None = None,
     callback: Callable[[Record], Any] | None = None,
     progress: bool = False,
+    keep_iterates: bool | None = None,
     checkpoint: str | os.PathLike | None = None,
 ) -> Result:
     r"""Minimises a smoothed function, one step of a solver at a time.
@@ -83,6 +87,9 @@ def minimise(
         bounds: a pair (low, high), each a number or a pytree like `y0`. `fun` sees no other points.
         callback: called with each step's `Record`; the run stops if it returns something true.
         progress: show a progress bar.
+        keep_iterates: whether the history has all iterates, which take as many numbers as there
+            are parameters for each step, in memory and in the checkpoint. By default with fewer
+            than 10,000 parameters. The callback gets each iterate all the same.
         checkpoint: a file that keeps the run. The same call takes up the run that it finds there
             and ends with the same result as if there had been no interruption; with a larger
             `max_steps` or `max_evaluations` it goes on. Written as often as is cheap, and at the
@@ -107,7 +114,8 @@ def minimise(
     """
     limits = max_steps, max_evaluations, max_seconds, target
     kind = optx.AbstractMinimiser, "NewtonCG", check_number
-    chosen, where, loop = (solver, sigma, None), (space, bounds), (callback, progress, checkpoint)
+    chosen, where = (solver, sigma, None), (space, bounds)
+    loop = _Loop(callback, progress, keep_iterates, checkpoint)
     return _run(kind, fun, y0, args, key, chosen, where, limits, loop)
 
 
@@ -128,6 +136,7 @@ def least_squares(
     bounds: tuple[PyTree, PyTree] | None = None,
     callback: Callable[[Record], Any] | None = None,
     progress: bool = False,
+    keep_iterates: bool | None = None,
     checkpoint: str | os.PathLike | None = None,
 ) -> Result:
     r"""Minimises a sum of squared residuals, one step of a solver at a time.
@@ -155,6 +164,7 @@ def least_squares(
         bounds: as for `minimise`.
         callback: as for `minimise`.
         progress: as for `minimise`.
+        keep_iterates: as for `minimise`.
         checkpoint: as for `minimise`.
 
     Returns:
@@ -179,8 +189,17 @@ def least_squares(
     limits = max_steps, max_evaluations, max_seconds, target
     kind = optx.AbstractLeastSquaresSolver, "GaussNewton", check_residuals
     chosen, where = (solver, sigma, support), (space, bounds)
-    loop = callback, progress, checkpoint
+    loop = _Loop(callback, progress, keep_iterates, checkpoint)
     return _run(kind, fun, y0, args, key, chosen, where, limits, loop)
+
+
+class _Loop(NamedTuple):
+    """What is done beside the steps."""
+
+    callback: Callable[[Record], Any] | None
+    progress: bool
+    keep_iterates: bool | None
+    checkpoint: str | os.PathLike | None
 
 
 def _run(
@@ -192,10 +211,10 @@ def _run(
     chosen: tuple[Any, PyTree, Any],
     where: tuple[PyTree, Any],
     limits: tuple[Any, ...],
-    loop: tuple[Callable[[Record], Any] | None, bool, str | os.PathLike | None],
+    loop: _Loop,
 ) -> Result:
     (interface, example, check), (solver, sigma, support) = kind, chosen
-    (space, bounds), (callback, progress, checkpoint) = where, loop
+    space, bounds = where
     check_call(fun, y0, bounds, space)
     natural = lambda y: y
     if space is not None:
@@ -217,17 +236,17 @@ def _run(
         else:
             problem = HostProblem.of(fun, solver, args, options, y)
         state = _first_state(problem, y, check)
-    run = Run(problem, y, state, natural)
-    if checkpoint is not None:
-        run.attach(checkpoint)
+    run = Run(problem, y, state, natural, _keeps(loop.keep_iterates, y))
+    if loop.checkpoint is not None:
+        run.attach(loop.checkpoint)
     try:
-        with tqdm(total=ends.expected, initial=run.steps, disable=not progress) as bar:
+        with tqdm(total=ends.expected, initial=run.steps, disable=not loop.progress) as bar:
             while (reason := run.done() or run.reached(ends)) is None:
                 record = run.step()
                 text = f"{record.evaluations} evaluations, fun = {record.fun:.4g}"
                 bar.set_postfix_str(text, refresh=False)
                 bar.update()
-                if callback is not None and callback(record):
+                if loop.callback is not None and loop.callback(record):
                     reason = "callback"
                     break
         return run.judged(reason)
@@ -237,6 +256,11 @@ def _run(
         raise MinimiseError(str(error), run.found("failed")) from (error.__cause__ or error)
     finally:
         run.save()
+
+
+def _keeps(asked: bool | None, y: PyTree[Array]) -> bool:
+    """Whether the history has the iterates."""
+    return sum(leaf.size for leaf in jax.tree.leaves(y)) < _MANY if asked is None else asked
 
 
 def _first_state(problem: Problem, y: PyTree, check: Callable[[PyTree], None]) -> Any:

@@ -24,19 +24,24 @@ class Record(NamedTuple):
         step: which step, from 1.
         evaluations: evaluations of the function so far.
         seconds: time since the start, compilation included; a resumed run counts on.
-        fun: the smoothed function where the step started, as its batch estimated it.
-        stderr: the standard error of `fun`; NaN where the batch cannot tell.
+        fun: the lowest value of the function so far, of all points that were evaluated, at the
+            iterate or not; of least squares half the sum of squares. With noise it owes much to
+            luck.
+        smoothed: the smoothed function where the step started, as its batch estimated it; NaN of a
+            solver that goes point by point.
+        stderr: the standard error of `smoothed`; NaN where the batch cannot tell.
         sigma: the smoothing width of the step, the widest if there are several.
-        y: the iterate after the step.
+        y: the iterate after the step; None in a history without iterates.
     """
 
     step: int
     evaluations: int
     seconds: float
     fun: float
+    smoothed: float
     stderr: float
     sigma: float
-    y: PyTree[np.ndarray]
+    y: PyTree[np.ndarray] | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,7 +64,7 @@ class Result:
             "callback", "interrupted", or what the solver says: "converged", "stalled" after too
             many evaluations without a lower point, "noise" where nothing but noise is left; in an
             error "nonfinite" or "failed".
-        history: one `Record` for each step.
+        history: one `Record` for each step, with the iterates if `keep_iterates` says so.
         solver: the solver, also where none was given.
         state: its last state.
     """

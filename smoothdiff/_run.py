@@ -93,6 +93,7 @@ class Run:
     y: PyTree
     state: Any
     natural: Callable[[PyTree], PyTree] = lambda y: y
+    keep_iterates: bool = True
     history: list[Record] = dataclasses.field(default_factory=list)
     start: float = dataclasses.field(default_factory=time.monotonic)
     file: Checkpoint | None = None
@@ -119,11 +120,11 @@ class Run:
             y0=self.y,
             args=problem.args,
             solver=(problem.solver, shapes),
+            keep_iterates=self.keep_iterates,
             **({"bounds": None} | problem.options),
         )
-        saved = self.file.load(
-            (self.y, self.state, Record(0, 0, 0.0, 0.0, 0.0, 0.0, self.natural(self.y)))
-        )
+        iterate = self.natural(self.y) if self.keep_iterates else None
+        saved = self.file.load((self.y, self.state, Record(0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, iterate)))
         if saved is not None:
             self.y, self.state = jax.tree.map(jnp.asarray, saved[:2])
             self.history = _unstack(saved[2])
@@ -155,13 +156,14 @@ class Run:
             step=progress.step.item(),
             evaluations=progress.evaluations.item(),
             seconds=time.monotonic() - self.start,
-            fun=progress.fun.item(),
+            fun=progress.lowest_fun.item(),
+            smoothed=progress.smoothed.item(),
             stderr=progress.stderr.item(),
             sigma=progress.sigma.item(),
             y=jax.device_get(self.natural(y)),
         )
         # Ctrl-C may come between any two lines: the state has the last word on what was done
-        self.history.append(record)
+        self.history.append(record if self.keep_iterates else record._replace(y=None))
         self.y, self.state, self.stopped = y, state, stopped
         if time.monotonic() >= self.save_due:
             self.save()

@@ -29,11 +29,11 @@ def history(
 ) -> Any:
     r"""The function against evaluations or seconds: the lowest so far, and the smoothed one.
 
-    $$ \min_{i \le t} f(y_i) \quad\text{and}\quad F(y_t) \pm 1.96 \text{ standard errors} $$
+    $$ \min_{i \le t} f(x_i) \quad\text{and}\quad F(y_t) \pm 1.96 \text{ standard errors} $$
 
-    Which of the two lines a run has depends on its solver: one that goes point by point keeps the
-    lowest value, one that takes a batch of samples a step the smoothed function. The dot is the
-    answer. The axis is logarithmic if the values are not negative and span a factor of ten.
+    The first is that of all points $x_i$ that were evaluated, the second that of the iterates,
+    where a solver takes a batch of samples a step. The dot is the answer. The axis is logarithmic
+    if the values are not negative and span a factor of ten.
 
     Args:
         result: what `minimise` or `least_squares` returned.
@@ -61,21 +61,20 @@ def history(
     if not records:
         raise ValueError("the run made no step, so there is nothing to plot: print the result")
     x = np.asarray([getattr(record, against) for record in records], float)
-    fun = np.asarray([record.fun for record in records])
-    stderr = np.asarray([record.stderr for record in records])
+    fun, smoothed, stderr = np.asarray([(r.fun, r.smoothed, r.stderr) for r in records]).T
     end = float(result.evaluations) if against == "evaluations" else x[-1]
     ax = _new_axes(1)[0] if ax is None else ax
-    shown, smoothed = [np.asarray([result.fun])], np.isfinite(stderr)
-    if np.any(smoothed):
-        at, value, error = x[smoothed], fun[smoothed], stderr[smoothed]
+    shown, estimated = [np.asarray([result.fun])], np.isfinite(stderr)
+    if np.any(estimated):
+        at, value, error = x[estimated], smoothed[estimated], stderr[estimated]
         if math.isfinite(result.smoothed) and math.isfinite(result.stderr):
             at, value = np.append(at, end), np.append(value, result.smoothed)
             error = np.append(error, result.stderr)
         _band(ax, at, value, _WITHIN * error)
         shown.append(value)
-    if not np.all(smoothed):
-        lowest = np.minimum.accumulate(fun[~smoothed])
-        at, value = np.append(x[~smoothed], end), np.append(lowest, lowest[-1])
+    known = np.isfinite(fun)
+    if np.any(known):
+        at, value = np.append(x[known], end), np.append(fun[known], fun[known][-1])
         ax.step(at, value, where="post", color=_FUNCTION, lw=1.2, label="lowest so far")
         shown.append(value)
     ax.plot([end], [result.fun], "o", color=_ANSWER, ms=5, label="answer", zorder=3)

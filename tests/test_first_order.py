@@ -78,7 +78,7 @@ def test_gradient_descent_follows_the_smoothed_gradient():
     state = run(bowl, solver, jnp.ones(2), jnp.zeros(2), steps=5).state
     # the batch of the fifth step was at the fourth iterate; of the iterate, each step adds an error
     # of 0.2 sqrt(3 / pairs) = 0.008, and of its square, after four, 0.03
-    assert state.progress.fun == pytest.approx(2 * 0.8**8, rel=0.1)
+    assert state.progress.smoothed == pytest.approx(2 * 0.8**8, rel=0.1)
 
 
 def test_pytrees_with_a_sigma_for_each_leaf_and_ad_where_there_is_none_within_bounds():
@@ -264,9 +264,8 @@ def test_progress_records_the_best_of_the_finite_steps_and_the_lowest_of_all():
         seen = Seen(jnp.full(1, 10.0 * i), jnp.float32(value))
         progress = progress.after(jnp.full(1, i), *values, 10, jnp.asarray(finite), seen)
     assert (progress.step, progress.evaluations) == (4, 40)
-    assert (progress.fun, progress.sigma) == (2.5, jnp.float32(0.7))
-    assert (progress.best_y, progress.best_fun) == (2, 2.0)
-    assert progress.best_stderr == jnp.float32(0.2)
+    assert (progress.smoothed, progress.sigma) == (2.5, jnp.float32(0.7))
+    assert (progress.best_y, progress.best_smoothed) == (2, 2.0)
     assert (progress.lowest_y, progress.lowest_fun, progress.start_y) == (10, 4.0, 0)
 
 

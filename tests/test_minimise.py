@@ -86,7 +86,7 @@ def assert_same(one, other):
     assert len(one.history) == len(other.history)
     for a, b in zip(one.history, other.history, strict=True):
         assert [*map(type, a)] == [*map(type, b)]
-        assert a[:2] + a[3:6] == b[:2] + b[3:6]
+        assert a[:2] + a[3:7] == b[:2] + b[3:7]
         np.testing.assert_array_equal(a.y, b.y)
 
 
@@ -119,7 +119,9 @@ def test_iterates_are_those_of_optimistix(dtype, to_the_last_bit):
     for name in ("fun", "smoothed", "stderr", "evaluations"):
         np.testing.assert_allclose(getattr(result, name), solution.stats[name], rtol=rtol)
     assert result.evaluations == 40 * N + JUDGING
-    np.testing.assert_allclose(result.history[-1].fun, solution.state.progress.fun, rtol=rtol)
+    np.testing.assert_allclose(
+        result.history[-1].smoothed, solution.state.progress.smoothed, rtol=rtol
+    )
 
 
 def test_a_new_key_does_not_trace_the_function_again_and_a_raw_one_gives_the_same_run():
@@ -150,12 +152,41 @@ def test_history_says_what_happened():
     )
     assert np.all(np.diff([0.0] + [r.seconds for r in records]) > 0)
     # 5 numbers of mean square y^2 + sigma^2; sum y^2 = 1.25
-    assert records[0].fun == pytest.approx(1.25 + 4 * 0.3**2, abs=4 * records[0].stderr)
+    assert records[0].smoothed == pytest.approx(1.25 + 4 * 0.3**2, abs=4 * records[0].stderr)
     for y in [result.y, *(r.y for r in records)]:
         assert jax.tree.structure(y) == jax.tree.structure(y0)
     assert all(isinstance(leaf, np.ndarray) for r in records for leaf in jax.tree.leaves(r.y))
     # the first update of Adam has the size of its learning rate
     assert records[0].y["a"] == pytest.approx(0.45, abs=1e-4)
+
+
+@pytest.mark.parametrize("solver", [ADAM, sd.NewtonCG(0.2)])
+def test_records_have_the_lowest_value_of_all_that_was_evaluated(solver, host):
+    run = sd.minimise(host_plateaus, Y0, NO_EDGE, key=KEY, solver=solver, max_steps=6)
+    for record in run.history:
+        assert record.fun == min(host.values[: record.evaluations])
+        assert np.isnan(record.smoothed) == (solver is not ADAM)
+    assert run.fun <= run.history[-1].fun
+
+
+@pytest.mark.parametrize(
+    ("n", "asked", "kept"), [(2, None, True), (2, False, False), (20_000, None, False)]
+)
+def test_the_history_has_iterates_where_they_are_few_or_asked_for(n, asked, kept, path):
+    seen, fun = [], lambda y, args: jnp.sum(y**2)
+    run = functools.partial(
+        sd.minimise, fun, jnp.ones(n), key=KEY, solver=ADAM, keep_iterates=asked, checkpoint=path
+    )
+    run(max_steps=2, callback=lambda record: seen.append(record.y))
+    size = path.stat().st_size
+    history = run(max_steps=12, callback=lambda record: seen.append(record.y)).history
+    assert [y.shape for y in seen] == [(n,)] * 12
+    for record, y in zip(history, seen, strict=True):
+        assert np.array_equal(record.y, y) if kept else record.y is None
+    # ten steps of six numbers, and the iterates if they are kept
+    assert path.stat().st_size - size < 10 * (8 * 7 + 4 * n * kept) + 100
+    with pytest.raises(ValueError, match="keep_iterates differed"):
+        run(max_steps=12, keep_iterates=not kept)
 
 
 # the budget

@@ -17,19 +17,18 @@ matplotlib.use("Agg")
 NAN = float("nan")
 
 
-def records(fun, stderr):
-    rows = enumerate(zip(fun, stderr, strict=True), start=1)
-    return [sd.Record(i, 10 * i, 0.5 * i, f, s, 0.1, np.zeros(2)) for i, (f, s) in rows]
-
-
-def result(fun, stderr, answer=0.5, smoothed=NAN, error=NAN):
-    history = records(fun, stderr)
+def result(fun, estimates=None, errors=None, answer=0.5, smoothed=NAN, error=NAN):
+    unknown = [NAN] * len(fun)
+    rows = zip(fun, estimates or unknown, errors or unknown, strict=True)
+    history = [
+        sd.Record(i, 10 * i, 0.5 * i, *row, 0.1, np.zeros(2)) for i, row in enumerate(rows, start=1)
+    ]
     numbers = answer, smoothed, error, 99
     return sd.Result(jnp.zeros(2), *numbers, "converged", history, solver=None, state=None)
 
 
-POINTS = result([3.0, 1.0, 2.0, 0.5], [NAN] * 4)
-BATCHES = result([3.0, 1.0, 2.0], [0.1, 0.2, 0.3], smoothed=1.5, error=0.4)
+POINTS = result([3.0, 1.0, 1.0, 0.5])
+BATCHES = result([2.5, 0.5, 0.5], [3.0, 1.0, 2.0], [0.1, 0.2, 0.3], smoothed=1.5, error=0.4)
 
 
 @pytest.fixture
@@ -66,7 +65,8 @@ def test_history_of_values_is_the_lowest_so_far(ax):
 
 def test_history_of_batches_is_smoothed_with_a_band(ax):
     sd.plot.history(BATCHES, ax=ax)
-    assert set(lines(ax)) == {"smoothed", "answer"}
+    assert set(lines(ax)) == {"smoothed", "lowest so far", "answer"}
+    np.testing.assert_allclose(lines(ax)["lowest so far"].get_ydata(), [2.5, 0.5, 0.5, 0.5])
     x, y = lines(ax)["smoothed"].get_data()
     np.testing.assert_allclose(x, [10, 20, 30, 99])
     np.testing.assert_allclose(y, [3, 1, 2, 1.5])
@@ -76,10 +76,11 @@ def test_history_of_batches_is_smoothed_with_a_band(ax):
         np.testing.assert_allclose((there.min(), there.max()), (low, high))
 
 
-def test_history_of_both(ax):
-    sd.plot.history(result([3.0, 2.0, 2.5, 1.0], [NAN, 0.1, NAN, 0.2]), ax=ax)
-    np.testing.assert_allclose(lines(ax)["smoothed"].get_data(), [[20, 40], [2, 1]])
-    np.testing.assert_allclose(lines(ax)["lowest so far"].get_data(), [[10, 30, 99], [3, 2.5, 2.5]])
+def test_history_leaves_out_what_is_not_known(ax):
+    found = result([np.inf, 2.0, 1.0], [NAN, 3.0, 2.0], [NAN, 0.1, NAN])
+    sd.plot.history(found, ax=ax)
+    np.testing.assert_allclose(lines(ax)["smoothed"].get_data(), [[20], [3]])
+    np.testing.assert_allclose(lines(ax)["lowest so far"].get_data(), [[20, 30, 99], [2, 1, 1]])
 
 
 def test_history_against_seconds(ax):
@@ -99,7 +100,7 @@ def test_history_against_seconds(ax):
     ],
 )
 def test_history_is_logarithmic_where_that_helps(ax, values, scale):
-    sd.plot.history(result(values, [NAN] * len(values), answer=values[-1]), ax=ax)
+    sd.plot.history(result(values, answer=values[-1]), ax=ax)
     assert ax.get_yscale() == scale
     ax.figure.canvas.draw()
 
@@ -116,7 +117,7 @@ def test_history_of_a_run(pyplot):
 
 def test_what_history_refuses(ax):
     with pytest.raises(ValueError, match="no step"):
-        sd.plot.history(result([], []), ax=ax)
+        sd.plot.history(result([]), ax=ax)
 
 
 LOOK = {

@@ -1,5 +1,6 @@
 """How methods that are solvers of smoothdiff run: by `sd.minimise` or its twin."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -49,7 +50,8 @@ class _Best:
         if self._moved and not moved:
             self._target = self._lowest
         self._moved = moved
-        self._lowest = min(self._lowest, step.fun)
-        if step.fun < self._target:
+        value = step.fun if math.isnan(step.smoothed) else step.smoothed
+        self._lowest = min(self._lowest, value)
+        if value < self._target:
             self._target, self._shown = np.inf, step.y
         return self._shown

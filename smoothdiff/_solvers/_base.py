@@ -21,22 +21,21 @@ promotion = partial(jax.numpy_dtype_promotion, "standard")
 class Progress(eqx.Module):
     """What a solver has done so far, in arrays only, as the field `progress` of its state.
 
-    `fun`, `stderr` and `sigma` belong to the last batch, `best_*` to the lowest estimate so far:
-    lowest by luck as much as by merit, hence a candidate and no answer. `lowest_*` is the point of
-    all that were evaluated at which the function itself was lowest, and `start_y` where the run
-    began. `finite` turns False when a step failed; the iterate is then the one from before that
-    step.
+    `smoothed`, `stderr` and `sigma` belong to the last batch, NaN where a step makes no estimate of
+    the smoothed function. `best_*` is the lowest estimate so far: lowest by luck as much as by
+    merit, hence a candidate and no answer. `lowest_*` is the point of all that were evaluated at
+    which the function itself was lowest, and `start_y` where the run began. `finite` turns False
+    when a step failed; the iterate is then the one from before that step.
     """
 
     step: Int[Array, ""]
     evaluations: Int[Array, ""]
-    fun: Float[Array, ""]
+    smoothed: Float[Array, ""]
     stderr: Float[Array, ""]
     sigma: Float[Array, ""]
     finite: Bool[Array, ""]
     best_y: PyTree[Array]
-    best_fun: Float[Array, ""]
-    best_stderr: Float[Array, ""]
+    best_smoothed: Float[Array, ""]
     lowest_y: PyTree[Array]
     lowest_fun: Float[Array, ""]
     start_y: PyTree[Array]
@@ -50,13 +49,12 @@ class Progress(eqx.Module):
         return Progress(
             step=count,
             evaluations=count,
-            fun=unknown,
+            smoothed=unknown,
             stderr=unknown,
             sigma=unknown,
             finite=good,
             best_y=y,
-            best_fun=unknown,
-            best_stderr=unknown,
+            best_smoothed=unknown,
             lowest_y=y,
             lowest_fun=unknown,
             start_y=y,
@@ -65,23 +63,23 @@ class Progress(eqx.Module):
     def after(
         self,
         y: PyTree[Array],
-        fun: Float[Array, ""],
+        smoothed: Float[Array, ""],
         stderr: Float[Array, ""],
         sigma: PyTree,
         evaluations: int | Int[Array, ""],
         finite: Bool[Array, ""],
         seen: Seen,
     ) -> "Progress":
-        """The progress after one more step, which estimated the function at `y`.
+        """The progress after one more step, which estimated the smoothed function at `y`.
 
         `seen` is the lowest of all that it evaluated, whether it failed or not.
         """
-        dtype = self.fun.dtype
-        fun, stderr = fun.astype(dtype), stderr.astype(dtype)
+        dtype = self.smoothed.dtype
+        smoothed, stderr = smoothed.astype(dtype), stderr.astype(dtype)
         widths = [jnp.max(jnp.asarray(s)).astype(dtype) for s in jax.tree.leaves(sigma)]
-        better = finite & (fun < self.best_fun)
-        best = (y, fun, stderr), (self.best_y, self.best_fun, self.best_stderr)
-        best_y, best_fun, best_stderr = jax.tree.map(lambda a, b: jnp.where(better, a, b), *best)
+        better = finite & (smoothed < self.best_smoothed)
+        best = (y, smoothed), (self.best_y, self.best_smoothed)
+        best_y, best_smoothed = jax.tree.map(lambda a, b: jnp.where(better, a, b), *best)
         # of equals the last: on a plateau that is further from where the run came in
         lower = jnp.isfinite(seen.value) & (seen.value <= self.lowest_fun)
         there = (seen.point, seen.value.astype(dtype)), (self.lowest_y, self.lowest_fun)
@@ -89,13 +87,12 @@ class Progress(eqx.Module):
         return Progress(
             step=self.step + 1,
             evaluations=self.evaluations + evaluations,
-            fun=fun,
+            smoothed=smoothed,
             stderr=stderr,
             sigma=jnp.max(jnp.stack(widths)),
             finite=finite,
             best_y=best_y,
-            best_fun=best_fun,
-            best_stderr=best_stderr,
+            best_smoothed=best_smoothed,
             lowest_y=lowest_y,
             lowest_fun=lowest_fun,
             start_y=self.start_y,

@@ -174,7 +174,7 @@ def step(
     progress = progress.after(y, fun, stderr, sigma, batch.count + tried, finite, seen)
     restarts = state.restarts
     if restarts is not None:
-        lowest = progress.best_fun < state.progress.best_fun
+        lowest = progress.best_smoothed < state.progress.best_smoothed
         first = BatchSearch.start(jax.tree.map(jnp.zeros_like, history))
         start = params.layout.tree(restarts.theta)
         (new_y, after), restarts = restarts.after(lowest, search.scale).next(

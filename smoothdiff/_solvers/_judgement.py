@@ -55,7 +55,7 @@ def judged(
     points = jax.tree.map(lambda *leaves: jnp.stack(leaves), *candidates)
     count, each = len(candidates), 1 + len(new)
     rounds = _rounds(count, each)
-    dtype = progress.fun.dtype
+    dtype = progress.lowest_fun.dtype
 
     def more(state: tuple[Array, Array]) -> Bool[Array, ""]:
         done, found = state

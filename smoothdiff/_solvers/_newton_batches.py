@@ -147,7 +147,7 @@ def step(
     progress = progress.after(y, value, stderr, width, len(z), finite, seen)
     restarts = state.restarts
     if restarts is not None:
-        lowest = progress.best_fun < state.progress.best_fun
+        lowest = progress.best_smoothed < state.progress.best_smoothed
         restarts = restarts.after(lowest, (metric, center.trust.width))
         first = _first(solver, params, restarts.theta), jax.tree.map(jnp.zeros_like, history)
         stall = going[1].trust.stall >= (solver.patience or _PATIENCE)

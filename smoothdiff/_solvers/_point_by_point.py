@@ -122,11 +122,10 @@ class PointStep(eqx.Module):
             finite = after.enough(max(sizes.first, _ENOUGH))
         finite = (finite | search.is_local()) & jnp.all(jnp.isfinite(theta))
         new_y, after = unless_failed(finite, (new_y, after), (self.y, search))
-        best = after.history.best(theta)[2]
         unknown = jnp.asarray(jnp.nan, theta.dtype)
         seen = Seen(params.layout.tree(point), fun)
         progress = progress.after(
-            self.y, best, unknown, params.sigma * width, sizes.step, finite, seen
+            self.y, unknown, unknown, params.sigma * width, sizes.step, finite, seen
         )
         restarts = state.restarts
         if solver.restarts:
@@ -160,7 +159,7 @@ class PointStep(eqx.Module):
         lower, count = fun < progress.lowest_fun, len(points)
         search = eqx.tree_at(lambda s: s.stale, search, jnp.where(lower, 0, search.stale + count))
         seen = Seen(params.layout.tree(point), fun)
-        rest = progress.fun, progress.stderr, progress.sigma, count, progress.finite, seen
+        rest = progress.smoothed, progress.stderr, progress.sigma, count, progress.finite, seen
         return PointState(progress.after(self.y, *rest), search, state.restarts)
 
     def _new(self, points: Float[Array, "K n"], rows: Float[Array, "K P"]) -> History:
@@ -185,7 +184,7 @@ class PointStep(eqx.Module):
         The smoothed function is that of the model, at no further evaluation.
         """
         progress, search, params = self.state.progress, self.state.search, self.params()
-        unknown = jnp.asarray(jnp.nan, progress.fun.dtype)
+        unknown = jnp.asarray(jnp.nan, progress.lowest_fun.dtype)
 
         def estimate(y: PyTree) -> tuple[Array, Array, Seen]:
             smoothed = progress.lowest_fun + search.smoothing()

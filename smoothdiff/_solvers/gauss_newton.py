@@ -61,8 +61,8 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     and is left out where that is more than 2e8.
 
     Nothing larger than history x history or n x n, for fewer than 100 parameters, is factorised.
-    The `fun` of a record is the loss at the best point; with batches it is the smoothed loss,
-    $\mathbb{E}_z[\frac12 \sum_p r_p(y + \sigma z)^2]$. The `smoothed` loss of the result is that of
+    Records have the `smoothed` loss, $\mathbb{E}_z[\frac12 \sum_p r_p(y + \sigma z)^2]$, with
+    batches only. The `smoothed` loss of the result is that of
     the last model, or of a last batch.
 
     Args:

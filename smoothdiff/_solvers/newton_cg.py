@@ -55,8 +55,8 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     Bounds are never left. A sample beyond them is clamped or, where that would throw it out of a
     narrow valley, pulled back along its ray, and the models take it where it was evaluated.
 
-    The `fun` of a record is the value at the best point; with batches it is the smoothed function.
-    The `smoothed` value of the result is that of the last model, or of a last batch.
+    Records have the `smoothed` function with batches only. The `smoothed` value of the result is
+    that of the last model, or of a last batch.
 
     Args:
         sigma: the smoothing width in the units of the parameters: a number or a pytree like the
