@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import PyTree
 
 from smoothdiff._solvers import AbstractSmoothSolver
+from smoothdiff._solvers._wrapped import wraps_ours
 
 _HOST = (
     jax.errors.TracerArrayConversionError,
@@ -51,10 +52,11 @@ def check_call(fun: Any, y0: Any, bounds: Any, space: Any) -> None:
 
 def check_solver(solver: Any, kind: type, example: str, sigma: Any, support: Any) -> None:
     """Raises TypeError or ValueError unless the solver can run here, with its own settings."""
-    if not isinstance(solver, AbstractSmoothSolver):
+    if not isinstance(solver, AbstractSmoothSolver) and not wraps_ours(solver):
         raise TypeError(
-            f"solver must be one of smoothdiff's, such as {example}, not {type(solver).__name__}: "
-            "others run under optimistix, on smooth(fun, sigma) with a fixed key"
+            f"solver must be one of smoothdiff's, such as {example}, or one of optimistix's around "
+            f"it, not {type(solver).__name__}: others run under optimistix, on smooth(fun, sigma) "
+            "with a fixed key"
         )
     if not isinstance(solver, kind):
         raise TypeError(

@@ -24,6 +24,8 @@ from smoothdiff._host_steps import HostProblem
 from smoothdiff._limits import Limits
 from smoothdiff._result import MinimiseError, Record, Result
 from smoothdiff._run import Problem, Run, inexact
+from smoothdiff._solvers import AbstractSmoothSolver
+from smoothdiff._solvers._wrapped import Wrapped
 from smoothdiff._unit_space import UnitSpace
 
 # from so many parameters on, the history does without iterates unless it is asked for them
@@ -71,7 +73,8 @@ def minimise(
         y0: where to start, a pytree of numbers and arrays.
         args: passed on to `fun`.
         key: a random key; the same key gives the same run.
-        solver: how to step, such as `NewtonCG(sigma)` or `FirstOrder(optax.adam(0.1), sigma)`.
+        solver: how to step, such as `NewtonCG(sigma)` or `FirstOrder(optax.adam(0.1), sigma)`, or
+            an optimistix minimiser that is given one of these, such as `BestSoFarMinimiser`.
         sigma: the smoothing width of the default solver, in the units of the parameters: how far
             from y0 to look at first. A number or a pytree like the parameters.
         target: a value that is good enough: the run ends where one as low was seen.
@@ -153,7 +156,7 @@ def least_squares(
         args: passed on to `fun`.
         key: a random key; the same key gives the same run.
         solver: how to step. By default `GaussNewton(sigma)`; `LocalGaussNewton(sigma, support)` if
-            there is a `support`.
+            there is a `support`. An optimistix solver around one is as good.
         sigma: as for `minimise`.
         support: which residuals each parameter may move, as for `LocalGaussNewton`.
         target: as for `minimise`; half the sum of squares.
@@ -228,6 +231,7 @@ def _run(
         solver = default_solver(y, bounds, sigma, residuals, support)
     else:
         check_solver(solver, interface, example, sigma, support)
+        solver = solver if isinstance(solver, AbstractSmoothSolver) else Wrapped(solver)
     options = {"key": key} if bounds is None else {"key": key, "bounds": bounds}
     ends = Limits.of(solver, y, *limits)
     with explained():

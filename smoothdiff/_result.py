@@ -41,7 +41,7 @@ class Record(NamedTuple):
     smoothed: float
     stderr: float
     sigma: float
-    y: PyTree[np.ndarray] | None
+    y: PyTree[np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,6 +19,7 @@ from smoothdiff._checkpoint import Checkpoint
 from smoothdiff._limits import Limits
 from smoothdiff._result import MinimiseError, Record, Result
 from smoothdiff._solvers import Progress
+from smoothdiff._solvers._wrapped import Wrapped
 
 # the share of the time that saving may take
 _SAVING = 0.05
@@ -177,30 +178,23 @@ class Run:
         if not jnp.isfinite(stats["fun"]):
             raise MinimiseError(_NONFINITE, self.found("nonfinite"))
         numbers = {name: value.item() for name, value in stats.items()}
-        return Result(
-            y=self.natural(y),
-            reason=reason,
-            history=self.history,
-            solver=self.problem.solver,
-            state=self.state,
-            **numbers,
-        )
+        return self._result(y, reason, **numbers)
 
     def found(self, reason: str, progress: Progress | None = None) -> Result:
         """The result of a run that was cut short: no evaluation is made for it."""
         p = progress or self.state.progress
         fun, evaluations, unknown = p.lowest_fun.item(), p.evaluations.item(), float("nan")
+        numbers = {"fun": fun, "smoothed": unknown, "stderr": unknown, "evaluations": evaluations}
+        return self._result(p.lowest_y, reason, **numbers)
+
+    def _result(self, y: PyTree, reason: str, **numbers: Any) -> Result:
+        solver, state = self.problem.solver, self.state
+        if isinstance(solver, Wrapped):
+            # those that the user knows
+            solver, state = solver.solver, state.state
         history = self.history[: self.steps]
         return Result(
-            y=self.natural(p.lowest_y),
-            fun=fun,
-            smoothed=unknown,
-            stderr=unknown,
-            evaluations=evaluations,
-            reason=reason,
-            history=history,
-            solver=self.problem.solver,
-            state=self.state,
+            self.natural(y), reason=reason, history=history, solver=solver, state=state, **numbers
         )
 
 

@@ -25,14 +25,18 @@ class Evaluator(eqx.Module):
 
     def __call__(self, points: Float[Array, "m n"]) -> tuple[Float[Array, "m P"], PyTree]:
         """The rows, and the aux of the first."""
+        rows, aux = self.with_aux(points)
+        return rows, jax.tree.map(lambda a: a[0], aux)
+
+    def with_aux(self, points: Float[Array, "m n"]) -> tuple[Float[Array, "m P"], PyTree]:
+        """The rows, and the aux of each."""
 
         def row(x: Array) -> tuple[Array, PyTree]:
             out, aux = self.fn(self.layout.tree(x), self.args)
             leaves = [jnp.ravel(leaf).astype(x.dtype) for leaf in jax.tree.leaves(out)]
             return jnp.concatenate(leaves), aux
 
-        rows, aux = jax.lax.map(row, points, batch_size=self.batch_size or len(points))
-        return rows, jax.tree.map(lambda a: a[0], aux)
+        return jax.lax.map(row, points, batch_size=self.batch_size or len(points))
 
     def funs(self, rows: Float[Array, "m P"]) -> Float[Array, " m"]:
         """What is minimised, of each row."""

@@ -1,5 +1,6 @@
 """The loop around searches that evaluate a function point by point: bounds, noise, restarts."""
 
+import dataclasses
 import math
 from collections.abc import Callable
 from functools import partial
@@ -38,11 +39,16 @@ _WIDTHS = 2.0
 
 
 class PointState(eqx.Module):
-    """The state of a run: `restarts` counts the searches that may still follow."""
+    """The state of a run: `restarts` counts the searches that may still follow.
+
+    `aux` is what the function returned beside its value at the iterate, and zeros before it was
+    evaluated there.
+    """
 
     progress: Progress
     search: AbstractPointSearch
     restarts: Array
+    aux: PyTree[Array]
 
 
 def final_evaluations(candidates: int) -> int:
@@ -50,13 +56,16 @@ def final_evaluations(candidates: int) -> int:
     return judging(0, new=candidates, old=1)
 
 
-def init(solver: Any, y: PyTree[Array], search: AbstractPointSearch) -> PointState:
+def init(
+    solver: Any, y: PyTree[Array], search: AbstractPointSearch, aux_struct: PyTree
+) -> PointState:
     """The state before a search that has evaluated nothing."""
     if solver.sampler is not None:
         draw = lambda key: _normal_points(solver, key, 1, search.start)
         jax.eval_shape(draw, jax.random.key(0))
     restarts = jnp.asarray(solver.restarts, jnp.int32)
-    return PointState(Progress.start(y, search.start.dtype), search, restarts)
+    aux = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), aux_struct)
+    return PointState(Progress.start(y, search.start.dtype), search, restarts, aux)
 
 
 class PointStep(eqx.Module):
@@ -147,7 +156,7 @@ class PointStep(eqx.Module):
             )
             restarts = restarts - (finite & ended).astype(restarts.dtype)
             restarts = jnp.where(least, 0, restarts)
-        return new_y, PointState(progress, after, restarts)
+        return new_y, PointState(progress, after, restarts, state.aux)
 
     def learnt(self, points: Float[Array, "K n"], rows: Float[Array, "K P"]) -> PointState:
         """The state with evaluations that it did not propose."""
@@ -160,7 +169,7 @@ class PointStep(eqx.Module):
         search = eqx.tree_at(lambda s: s.stale, search, jnp.where(lower, 0, search.stale + count))
         seen = Seen(params.layout.tree(point), fun)
         rest = progress.smoothed, progress.stderr, progress.sigma, count, progress.finite, seen
-        return PointState(progress.after(self.y, *rest), search, state.restarts)
+        return PointState(progress.after(self.y, *rest), search, state.restarts, state.aux)
 
     def _new(self, points: Float[Array, "K n"], rows: Float[Array, "K P"]) -> History:
         """These evaluations, of which those count that are finite."""
@@ -171,8 +180,15 @@ class PointStep(eqx.Module):
     def step(self, evaluate: Evaluator) -> tuple[PyTree[Array], PointState, PyTree]:
         """The next evaluation, or as many as run at once."""
         points, proposal = self.propose()
-        rows, aux = evaluate(points)
-        return *self.counted(points, rows, self.searched(points, rows, proposal)), aux
+        rows, aux = evaluate.with_aux(points)
+        y, state = self.counted(points, rows, self.searched(points, rows, proposal))
+        # what a step returns belongs to the iterate before it; the first of all points is the start
+        first = self.state.progress.evaluations == 0
+        here = jax.tree.map(lambda a, old: jnp.where(first, a[0], old), aux, state.aux)
+        same = jnp.all(points == state.search.iterate()[None], axis=1)
+        known, at = jnp.any(same), jnp.argmax(same)
+        there = jax.tree.map(lambda a, old: jnp.where(known, a[at], old), aux, here)
+        return y, dataclasses.replace(state, aux=there), here
 
     def judge(
         self,

@@ -183,7 +183,7 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         usual = max(min(max(12 * n, 32), 256), 3 * sizes.first, 2 * n)
         length = max(self.history or usual, sizes.first, n + 2)
         search = ResidualSearch.of(theta, History.empty(length, n, size, theta.dtype))
-        return _point_by_point.init(self, y, search)
+        return _point_by_point.init(self, y, search, aux_struct)
 
     def step(self, fn, y, args, options, state, tags):
         """The next evaluations."""
@@ -213,4 +213,5 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         else:
             parts = _point_by_point.PointStep(self, sizes, y, options, state)
             y, stats = parts.judge(Evaluator(fn, args, layout_of(y), True, self.batch_size).values)
+            aux = state.aux
         return y, aux, stats

@@ -164,7 +164,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         history = History.empty(length, n, 1, theta.dtype)
         width = jnp.ones((), theta.dtype)
         search = ValueSearch.of(params, theta, params.sigma, width, history)
-        return _point_by_point.init(self, y, search)
+        return _point_by_point.init(self, y, search, aux_struct)
 
     def step(self, fn, y, args, options, state, tags):
         """The next evaluations."""
@@ -199,4 +199,5 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         else:
             parts = _point_by_point.PointStep(self, sizes, y, options, state)
             y, stats = parts.judge(Evaluator(fn, args, layout_of(y), False, None).values)
+            aux = state.aux
         return y, aux, stats
