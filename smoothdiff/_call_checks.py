@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import optimistix as optx
 from jaxtyping import PyTree
 
 from smoothdiff._solvers import AbstractSmoothSolver
@@ -22,11 +23,8 @@ _HOST = (
 
 def check_call(fun: Any, y0: Any, bounds: Any, space: Any) -> None:
     """Raises TypeError or ValueError for arguments in another order or of another library."""
-    if (
-        isinstance(fun, AbstractSmoothSolver)
-        or callable(y0)
-        or isinstance(y0, AbstractSmoothSolver)
-    ):
+    solvers = AbstractSmoothSolver | optx.AbstractIterativeSolver
+    if isinstance(fun, solvers) or callable(y0) or isinstance(y0, solvers):
         raise TypeError(
             "the arguments are (fun, y0, args), and the solver goes by keyword: write "
             "sd.minimise(fun, y0, args, key=key, solver=solver)"

@@ -43,6 +43,10 @@ class HostProblem(Problem):
         check(out)
         return self.host.init(y, out)
 
+    def stage(self, state: PointState) -> int:
+        """That of the search."""
+        return int(state.search.stage)
+
     def step(self, y: PyTree, state: PointState) -> tuple[PyTree, PointState, Bool[Array, ""]]:
         """The next evaluations, between what is compiled for the stage of the search."""
         points, proposal = self.host.propose(y, state)

@@ -89,7 +89,8 @@ def minimise(
             which sigma is given; `fun`, the records and the result have natural values.
         bounds: a pair (low, high), each a number or a pytree like `y0`. `fun` sees no other points.
         callback: called with each step's `Record`; the run stops if it returns something true.
-        progress: show a progress bar.
+        progress: show a progress bar, which says "compiling" in the first step, and in the first of
+            each kind.
         keep_iterates: whether the history has all iterates, which take as many numbers as there
             are parameters for each step, in memory and in the checkpoint. By default with fewer
             than 10,000 parameters. The callback gets each iterate all the same.
@@ -245,8 +246,13 @@ def _run(
         run.attach(loop.checkpoint)
     try:
         with tqdm(total=ends.expected, initial=run.steps, disable=not loop.progress) as bar:
+            compiled = set()
             while (reason := run.done() or run.reached(ends)) is None:
+                if (stage := problem.stage(run.state)) not in compiled:
+                    bar.set_description_str("compiling")
                 record = run.step()
+                compiled.add(stage)
+                bar.set_description_str(refresh=False)
                 text = f"{record.evaluations} evaluations, fun = {record.fun:.4g}"
                 bar.set_postfix_str(text, refresh=False)
                 bar.update()

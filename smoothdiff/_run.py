@@ -56,6 +56,10 @@ class Problem(eqx.Module):
         # weak types would compile the second step anew
         return jax.tree.map(lambda a: jnp.asarray(a, a.dtype), state)
 
+    def stage(self, state: Any) -> int:
+        """Which of the steps comes next that are compiled each by itself."""
+        return 0
+
     @eqx.filter_jit
     def step(self, y: PyTree, state: Any) -> tuple[PyTree, Any, Bool[Array, ""]]:
         """The next iterate and state, and whether the solver wants to stop there."""

@@ -420,3 +420,14 @@ def test_the_bar_shows_only_when_asked_for(capsys):
     assert out == ""
     assert "3/3" in err
     assert f"{3 * N} evaluations" in err
+
+
+def test_the_bar_says_that_it_compiles(capsys):
+    """At the first step, and where a search point by point has its first local one."""
+    run = functools.partial(sd.minimise, waves, Y0, TARGET, key=KEY, progress=True)
+    run(solver=ADAM, max_steps=3)
+    assert capsys.readouterr().err.count("compiling") == 1
+    run(solver=sd.NewtonCG(0.3), max_steps=8)
+    err = capsys.readouterr().err
+    assert err.count("compiling") == 2
+    assert "compiling" not in err.split("\r")[-1]

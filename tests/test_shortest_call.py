@@ -134,26 +134,6 @@ def test_limits_that_are_none_are_refused(limit, match):
 # under optimistix
 
 
-def test_solvers_end_by_themselves_under_optimistix(x64):
-    options = {"key": KEY}
-    found = optx.minimise(bowl, sd.NewtonCG(0.1), jnp.ones(3), options=options, max_steps=1000)
-    np.testing.assert_allclose(found.value, TARGET, atol=1e-4)
-    assert found.result == optx.RESULTS.successful
-    found = optx.least_squares(
-        valley, sd.GaussNewton(0.1), jnp.array([-1.2, 1.0]), options=options, max_steps=1000
-    )
-    np.testing.assert_allclose(found.value, 1, atol=1e-4)
-    flat = optx.minimise(
-        lambda y, _: 0 * jnp.sum(y),
-        sd.NewtonCG(0.1),
-        jnp.ones(3),
-        options=options,
-        max_steps=1000,
-        throw=False,
-    )
-    assert flat.result == optx.RESULTS.stagnation
-
-
 def test_the_host_takes_the_steps_of_optimistix(x64):
     """But for rounding: the parts of a step are compiled each by itself."""
     for solver, run, twin, fun in [
@@ -208,6 +188,11 @@ def test_another_function_or_sigma_compiles_nothing_but_the_function(caplog):
         (lambda: minimise(lambda y: y, 1.0, key=KEY), TypeError, "write lambda y, args: fun"),
         (
             lambda: minimise(bowl, sd.NewtonCG(1.0), jnp.ones(3), key=KEY),
+            TypeError,
+            "by keyword",
+        ),
+        (
+            lambda: minimise(bowl, optx.BFGS(1e-3, 1e-3), jnp.ones(3), key=KEY),
             TypeError,
             "by keyword",
         ),
