@@ -19,7 +19,9 @@ def test_simulators_give_the_same_finite_numbers_twice(name):
         assert np.all(np.isfinite(first))
         np.testing.assert_array_equal(first, again)
     if simulator.truth is not None:
-        assert np.all(np.asarray(fun(simulator.truth, None)) == 0)
+        # but for float32, in which the parameters come
+        there = np.linalg.norm(np.asarray(fun(simulator.truth, None)))
+        assert there <= 1e-3 * np.linalg.norm(first)
 
 
 def test_a_run_is_there_at_one_percent_of_the_way():

@@ -32,7 +32,7 @@ TASKS = ("shadow", "mug", "bunny", "box2", "quad", "rosenbrock")
 STARTS = 10
 FACTORS = (0.125, 0.25, 0.5, 1.0, 2.0)  # of the default sigma
 SHARE = 0.2  # of a range, the default sigma
-BUDGET = 200
+BUDGET = 150
 LEVEL = 0.01
 TARGET = 1.3
 FILES = sorted(Path(sd.__file__).parent.glob("**/*.py"))
@@ -104,9 +104,11 @@ def trace(case: Case, seed: int, factor: float | None) -> dict[str, Any]:
     chosen = {} if factor is None else {"sigma": case.sigma(factor)}
     evaluations, errors = [0], [np.inf if case.error is None else case.error(y0)]
 
-    def look(record: sd.Record) -> None:
+    def look(record: sd.Record) -> bool:
         evaluations.append(record.evaluations)
         errors.append(record.fun if case.error is None else case.error(record.y))
+        first = errors[1] if case.error is None else errors[0]
+        return errors[-1] <= LEVEL / 2 * first
 
     key = jax.random.key(seed)
     limit = {"max_evaluations": BUDGET, "callback": look}
