@@ -5,6 +5,7 @@ from smoothdiff._aggregate import Aggregate
 from smoothdiff._baselines import AbstractBaseline
 from smoothdiff._black_box import black_box
 from smoothdiff._call import Options
+from smoothdiff._check_gradient import GradientCheck, check_gradient
 from smoothdiff._control_variate import control_variate
 from smoothdiff._filtered_adam import filter_updates, filtered_adam, scale_by_filtered_adam
 from smoothdiff._gp import GaussianProcess
@@ -44,6 +45,7 @@ __all__ = [
     "GaussNewton",
     "Gaussian",
     "GaussianProcess",
+    "GradientCheck",
     "HessianOperator",
     "Importance",
     "Integer",
@@ -66,6 +68,7 @@ __all__ = [
     "Uniform",
     "ZeroGrads",
     "black_box",
+    "check_gradient",
     "control_variate",
     "difference_hvp",
     "filter_updates",

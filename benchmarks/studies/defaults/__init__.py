@@ -28,7 +28,7 @@ from benchmarks.studies.defaults.simulators import SIMULATORS
 
 HELP = "the shortest call against the best of hand-chosen settings"
 OPTIONS = ("names", "fresh")
-TASKS = ("shadow", "mug", "bunny", "box2", "quad", "rosenbrock")
+TASKS = ("shadow", "mug", "bunny", "box2", "quad", "brdf")
 STARTS = 10
 FACTORS = (0.125, 0.25, 0.5, 1.0, 2.0)  # of the default sigma
 SHARE = 0.2  # of a range, the default sigma
