@@ -162,8 +162,16 @@ def check_gradient(
         return treedef.unflatten([part.reshape(leaf.shape) for part, leaf in parts])
 
     width = np.asarray(params.sigma, float)
-    numbers = (tree(x / width) for x in (mean, mean - half, mean + half, true))
-    return GradientCheck(tree(wrong), tree(undecided), *numbers, level, 2 * pairs)
+    return GradientCheck(
+        wrong=tree(wrong),
+        undecided=tree(undecided),
+        difference=tree(mean / width),
+        low=tree((mean - half) / width),
+        high=tree((mean + half) / width),
+        gradient=tree(true / width),
+        level=level,
+        evaluations=2 * pairs,
+    )
 
 
 def _slopes(

@@ -78,7 +78,7 @@ def test_wrong_entries_are_found_and_no_others(name):
         called = set(np.flatnonzero(found.wrong))
         assert set(wrong) <= called
         alarms += called != set(wrong)
-        assert found.passed == (not np.any(found.wrong | found.undecided))
+        assert found.passed == (not np.any([found.wrong, found.undecided]))
         assert found.evaluations == 1024
     # one of twenty is right to be called wrong; that two of three are has a chance of 0.7 %
     assert alarms <= 1

@@ -53,7 +53,7 @@ class Case(NamedTuple):
 
 def of_task(name: str) -> Case:
     """With bounds, on the residuals if there are some, scored by the picture without noise."""
-    task = _registry.task(name).build(False)
+    (task,) = _registry.family(name, False)
     problem, score = task.problem, task.score
     residuals, image = problem.residuals, score.image
     error = jax.jit(score.loss or problem.loss)
@@ -123,9 +123,8 @@ def measure(options: Namespace, folder: Path) -> dict[str, Any]:
     """Of each case the evaluations from each start, by the shortest call and by each setting."""
     lines = []
     for name, case in cases(options.names):
-        took = {factor: [] for factor in (None, *FACTORS)}
+        took, runs = {factor: [] for factor in (None, *FACTORS)}, {}
         for seed in tqdm(range(STARTS), desc=name, unit="start"):
-            runs = {}
             for factor in took:
                 path = folder / "runs" / name / f"{seed}-{factor}.npz"
                 make = partial(trace, case, seed, factor)

@@ -45,11 +45,9 @@ def ball(y: dict) -> np.ndarray:
     state, now, places = [0.0, float(y["height"]), float(y["speed"]), 0.0], 0.0, []
     times = np.linspace(0, 3, 41)[1:]
     fall = lambda t, s: [s[2], s[3], 0, -9.81]
-    ground = lambda t, s: s[1]
-    ground.terminal, ground.direction = True, -1
     for _ in range(5):
         due = times[times > now]
-        way = solve_ivp(fall, (now, 3.0), state, t_eval=due, events=ground, rtol=1e-6)
+        way = solve_ivp(fall, (now, 3.0), state, t_eval=due, events=_ground, rtol=1e-6)
         places += list(np.reshape(way.y, (4, -1))[:2].T)  # an empty list where none was due
         if way.status == 0 or not len(way.t_events[0]):
             break
@@ -57,6 +55,14 @@ def ball(y: dict) -> np.ndarray:
         state = [state[0], 0.0, state[2], -float(y["bounce"]) * state[3]]
     rest = [[state[0], 0.0]] * (len(times) - len(places))  # it has come to lie
     return np.asarray(places + rest, np.float32)
+
+
+def _ground(t: float, s: np.ndarray) -> float:
+    return s[1]
+
+
+setattr(_ground, "terminal", True)  # noqa: B010, as solve_ivp asks for
+setattr(_ground, "direction", -1)  # noqa: B010
 
 
 def drawing(y: dict) -> np.ndarray:
@@ -89,7 +95,8 @@ def reaction(y: dict) -> np.ndarray:
 def model(y: dict) -> np.ndarray:
     """The error of support vector regression in threefold cross-validation, scikit-learn."""
     inputs, targets = load_diabetes(return_X_y=True)
-    fit = SVR(C=float(y["C"]), gamma=float(y["gamma"]), epsilon=float(y["epsilon"]))
+    settings: Any = {name: float(y[name]) for name in ("C", "gamma", "epsilon")}
+    fit = SVR(**settings)
     scored = {"cv": 3, "scoring": "neg_mean_squared_error"}
     scores = cross_val_score(fit, inputs[:120], targets[:120], **scored)
     return np.asarray(-np.mean(scores), np.float32)
