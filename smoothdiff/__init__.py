@@ -32,6 +32,7 @@ from smoothdiff._solvers.zerograds import ZeroGrads
 from smoothdiff._spaces import AbstractSpace
 from smoothdiff._support import local_support, matrix_support, moving_support, probe_support
 from smoothdiff._unbounded import Periodic, Positive, Real
+from smoothdiff._with_covariance import with_covariance
 
 __version__ = "0.1.0"
 
@@ -93,4 +94,5 @@ __all__ = [
     "smooth_quadratic",
     "smooth_value_and_grad",
     "surrogates",
+    "with_covariance",
 ]

@@ -55,20 +55,16 @@ class HostProblem(Problem):
 
     def judge(self, y: PyTree, state: PointState) -> tuple[PyTree, dict[str, Any]]:
         """Decided on the host, so that nothing is compiled for it."""
-        evaluate, at_once = self._evaluator(y), self.host.sizes.step
+        evaluate = self._evaluator(y)
 
-        # as many at once as in a step, by the program that evaluated them before
         def values(points: PyTree[Array]) -> Array:
             vectors = jax.vmap(lambda y: evaluate.layout.vector(jax.tree.leaves(y)))(points)
-            parts = [vectors[i : i + at_once] for i in range(0, len(vectors), at_once)]
-            rows = jnp.concatenate([_rows(evaluate, part) for part in parts])
-            return evaluate.funs(rows)
+            return evaluate.funs(rows_at(evaluate, vectors, self.host.sizes.step))
 
         return self.host.parts(y, state).judge(values, _loop)
 
     def _evaluator(self, y: PyTree) -> Evaluator:
-        size = getattr(self.solver, "batch_size", None)
-        return Evaluator(_Function(self.fun), self.args, layout_of(y), self.solver.squares, size)
+        return evaluator(self.fun, self.solver, self.args, y)
 
 
 class HostSteps(eqx.Module):
@@ -143,6 +139,21 @@ class _Function(eqx.Module):
 
     def __call__(self, y: PyTree, args: PyTree) -> tuple[PyTree[Array], None]:
         return jax.tree.map(jnp.asarray, self.fun(y, args)), None
+
+
+def evaluator(fun: Callable, solver: Any, args: PyTree, y: PyTree[Array]) -> Evaluator:
+    """The function for a solver and parameters like `y`."""
+    size = getattr(solver, "batch_size", None)
+    return Evaluator(_Function(fun), args, layout_of(y), solver.squares, size)
+
+
+def rows_at(evaluate: Evaluator, points: Float[Array, "m n"], at_once: int) -> Float[Array, "m P"]:
+    """What the function returns at more points than those of a step.
+
+    As many at once as in a step, by the program that evaluated those.
+    """
+    parts = [points[i : i + at_once] for i in range(0, len(points), at_once)]
+    return jnp.concatenate([_rows(evaluate, part) for part in parts])
 
 
 @eqx.filter_jit

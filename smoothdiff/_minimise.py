@@ -220,10 +220,9 @@ def _run(
     (interface, example, check), (solver, sigma, support) = kind, chosen
     space, bounds = where
     check_call(fun, y0, bounds, space)
-    natural = lambda y: y
+    units = UnitSpace.of(y0, space)
     if space is not None:
-        units = UnitSpace.of(y0, space)
-        fun, y0, natural = units.wrap(fun), units.unit(y0), units.natural
+        fun, y0 = units.wrap(fun), units.unit(y0)
         bounds = units.bounds()
         sigma = units.sigma() if sigma is None and solver is None else sigma
     y = jax.tree.map(inexact, y0)
@@ -241,7 +240,7 @@ def _run(
         else:
             problem = HostProblem.of(fun, solver, args, options, y)
         state = _first_state(problem, y, check)
-    run = Run(problem, y, state, natural, _keeps(loop.keep_iterates, y))
+    run = Run(problem, y, state, units, _keeps(loop.keep_iterates, y))
     if loop.checkpoint is not None:
         run.attach(loop.checkpoint)
     try:

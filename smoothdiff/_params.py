@@ -175,8 +175,8 @@ def take_apart(target: PyTree, sigma: PyTree, bounds: tuple[PyTree, PyTree] | No
     if bounds is not None:
         if not (isinstance(bounds, tuple | list) and len(bounds) == 2):
             raise ValueError("bounds must be a pair (low, high) of numbers or pytrees")
-        lows = _sides(bounds[0], -np.inf, target)
-        highs = _sides(bounds[1], np.inf, target)
+        lows = side_leaves(bounds[0], -np.inf, target)
+        highs = side_leaves(bounds[1], np.inf, target)
         for lo, hi, leaf, name, keep in zip(lows, highs, leaves, names, smoothed, strict=True):
             if keep:
                 _check_bounds(lo, hi, leaf, name)
@@ -254,7 +254,8 @@ def _sigma_fits(sigma: Any, leaf: Array) -> Array:
     return jnp.all((theta + width / 2 > theta) & (width < jnp.inf))
 
 
-def _sides(side: PyTree, default: float, target: PyTree) -> list:
+def side_leaves(side: PyTree, default: float, target: PyTree) -> list:
+    """One side of the bounds for each leaf of `target`; the default where it is None."""
     return [default if s is None else s for s in _match(side, target, "bounds")]
 
 

@@ -1,11 +1,16 @@
 """What a run gives: a record of each step, a result, and an error that keeps what was found."""
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Float, PyTree
+
+from smoothdiff._parameter_errors import Answer, ParameterErrors
+from smoothdiff._solvers._history import History
+from smoothdiff._solvers._point_by_point import PointState
 
 _RESULTS = {
     "converged": optx.RESULTS.successful,
@@ -15,6 +20,10 @@ _RESULTS = {
     "nonfinite": optx.RESULTS.nonfinite,
     "failed": optx.RESULTS.breakdown,
 }
+NO_COVARIANCE = (
+    "only results of sd.least_squares with GaussNewton and fewer than 100 parameters have a "
+    "covariance"
+)
 
 
 class Record(NamedTuple):
@@ -67,6 +76,7 @@ class Result:
         history: one `Record` for each step, with the iterates if `keep_iterates` says so.
         solver: the solver, also where none was given.
         state: its last state.
+        answer: `y` as the solver sees it, in unit coordinates and within bounds.
     """
 
     y: PyTree[Array]
@@ -78,6 +88,55 @@ class Result:
     history: list[Record] = dataclasses.field(repr=False)
     solver: Any = dataclasses.field(repr=False)
     state: Any = dataclasses.field(repr=False)
+    answer: Answer | None = dataclasses.field(default=None, repr=False)
+
+    @property
+    def covariance(self) -> Float[Array, "n n"] | None:
+        r"""The covariance of the parameters of least squares, which are taken as one vector.
+
+        $$ C = s^2 (J^T J)^{-1}, \qquad s^2 = \sum_p r_p^2 / (P - n) $$
+
+        It holds at a minimum, for P residuals whose errors are independent and of the same size. J
+        is fitted to those evaluations of the run that are near `y`, and no more are made for it.
+        With a space, C is that in unit coordinates, times the slopes of the natural values.
+
+        NaN for a parameter at a bound, where the others' errors hold it, and for those of which the
+        evaluations do not tell enough; a warning names them, and `with_covariance` evaluates more.
+        Do so, too, for a function that jumps, of which near evaluations may show one jump alone.
+        None unless the solver is `GaussNewton` with fewer than 100 parameters.
+        """
+        return None if self._errors is None else self._errors.covariance
+
+    @property
+    def parameter_errors(self) -> PyTree:
+        """The standard errors of the parameters, a pytree like `y`: the roots of the variances.
+
+        None where there is no covariance. `stderr` is that of the smoothed function.
+        """
+        return None if self._errors is None else self._errors.standard
+
+    def parameter_intervals(self, level: float = 0.95) -> tuple[PyTree, PyTree]:
+        """The ends (low, high) of intervals that hold a parameter with this probability.
+
+        By Student's t with P - n degrees of freedom, and symmetric in unit coordinates: with a
+        logarithmic scale they are factors, and stay positive.
+
+        Raises:
+            ValueError: a level that is no probability; a result without a covariance.
+        """
+        if not 0 < level < 1:
+            raise ValueError(f"level={level} must be between 0 and 1, such as 0.95")
+        if self._errors is None:
+            raise ValueError(NO_COVARIANCE)
+        return self._errors.intervals(level)
+
+    @functools.cached_property
+    def _errors(self) -> ParameterErrors | None:
+        """Computed when it is asked for."""
+        history = kept_residuals(self)
+        if self.answer is None or history is None:
+            return None
+        return ParameterErrors.of(self.y, self.answer, history, self.fun)
 
     @property
     def value(self) -> PyTree[Array]:
@@ -94,6 +153,13 @@ class Result:
         """The numbers of this result, as optimistix has them for a solver."""
         names = "fun", "smoothed", "stderr", "evaluations"
         return {name: getattr(self, name) for name in names}
+
+
+def kept_residuals(result: Result) -> History | None:
+    """The evaluations that the run has kept, if they are of residuals, point by point."""
+    state = result.state
+    point_by_point = isinstance(state, PointState) and result.solver.squares
+    return state.search.history if point_by_point else None
 
 
 class MinimiseError(RuntimeError):

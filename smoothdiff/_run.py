@@ -17,9 +17,11 @@ from jaxtyping import Array, Bool, PyTree
 from smoothdiff._black_box import reraise
 from smoothdiff._checkpoint import Checkpoint
 from smoothdiff._limits import Limits
+from smoothdiff._parameter_errors import Answer
 from smoothdiff._result import MinimiseError, Record, Result
 from smoothdiff._solvers import Progress
 from smoothdiff._solvers._wrapped import Wrapped
+from smoothdiff._unit_space import UnitSpace
 
 # the share of the time that saving may take
 _SAVING = 0.05
@@ -97,7 +99,7 @@ class Run:
     problem: Problem
     y: PyTree
     state: Any
-    natural: Callable[[PyTree], PyTree] = lambda y: y
+    units: UnitSpace
     keep_iterates: bool = True
     history: list[Record] = dataclasses.field(default_factory=list)
     start: float = dataclasses.field(default_factory=time.monotonic)
@@ -128,7 +130,7 @@ class Run:
             keep_iterates=self.keep_iterates,
             **({"bounds": None} | problem.options),
         )
-        iterate = self.natural(self.y) if self.keep_iterates else None
+        iterate = self.units.natural(self.y) if self.keep_iterates else None
         saved = self.file.load((self.y, self.state, Record(0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, iterate)))
         if saved is not None:
             self.y, self.state = jax.tree.map(jnp.asarray, saved[:2])
@@ -165,7 +167,7 @@ class Run:
             smoothed=progress.smoothed.item(),
             stderr=progress.stderr.item(),
             sigma=progress.sigma.item(),
-            y=jax.device_get(self.natural(y)),
+            y=jax.device_get(self.units.natural(y)),
         )
         # Ctrl-C may come between any two lines: the state has the last word on what was done
         self.history.append(record if self.keep_iterates else record._replace(y=None))
@@ -198,7 +200,13 @@ class Run:
             solver, state = solver.solver, state.state
         history = self.history[: self.steps]
         return Result(
-            self.natural(y), reason=reason, history=history, solver=solver, state=state, **numbers
+            self.units.natural(y),
+            reason=reason,
+            history=history,
+            solver=solver,
+            state=state,
+            answer=Answer(y, self.units, self.problem.options.get("bounds")),
+            **numbers,
         )
 
 

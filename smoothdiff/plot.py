@@ -175,23 +175,29 @@ def slice(
 
 
 def errors(
-    values: PyTree, stderrs: PyTree, labels: Sequence[str] | None = None, ax: Any = None
+    values: PyTree | Result,
+    stderrs: PyTree = None,
+    labels: Sequence[str] | None = None,
+    ax: Any = None,
 ) -> Any:
     r"""Parameters with their 95 % intervals, one under the other.
 
     $$ y_j \pm 1.96 \, s_j $$
 
     Args:
-        values: the parameters, a pytree of numbers and arrays.
-        stderrs: their standard errors, a pytree like it. No interval where one is not finite.
-        labels: a name for each number, with its unit; by default from the pytree.
+        values: what `least_squares` returned, which is drawn with its `parameter_intervals`; or the
+            parameters, a pytree of numbers and arrays.
+        stderrs: of parameters their standard errors, a pytree like them. No interval where one is
+            not finite.
+        labels: a name for each number, with its unit; by default from the space, or the pytree.
         ax: the matplotlib axes to draw into, by default new ones.
 
     Returns:
         The axes.
 
     Raises:
-        ValueError: another number of standard errors or labels than of values.
+        ValueError: another number of standard errors or labels than of values; parameters without
+            standard errors, or a result that has none.
 
     Example:
         >>> import matplotlib.figure, smoothdiff as sd
@@ -202,15 +208,25 @@ def errors(
         >>> [tick.get_text() for tick in ax.get_yticklabels()]
         ['drag', 'mass']
     """
-    labels = UnitSpace.of(values, None).labels() if labels is None else list(labels)
-    y, s = (_flat(tree) for tree in (values, stderrs))
-    for what, number in (("standard errors", len(s)), ("labels", len(labels))):
-        if number != len(y):
-            raise ValueError(f"there are {number} {what} for {len(y)} values: give one for each")
+    if isinstance(values, Result):
+        if stderrs is not None:
+            raise ValueError("a result has its own errors: leave out stderrs")
+        low, high = (_flat(end) for end in values.parameter_intervals())
+        units = UnitSpace.of(values.y, None) if values.answer is None else values.answer.units
+        usual, y = units.labels(), _flat(values.y)
+    else:
+        usual, y, s = UnitSpace.of(values, None).labels(), _flat(values), _flat(stderrs)
+        if len(s) != len(y):
+            raise ValueError(
+                f"there are {len(s)} standard errors for {len(y)} values: give one for each"
+            )
+        low, high = y - _WITHIN * s, y + _WITHIN * s
+    labels = usual if labels is None else list(labels)
+    if len(labels) != len(y):
+        raise ValueError(f"there are {len(labels)} labels for {len(y)} values: give one for each")
     ax = _new_axes(1)[0] if ax is None else ax
-    rows, known = np.arange(len(y)), np.isfinite(s)
-    reach = _WITHIN * s[known]
-    ax.hlines(rows[known], y[known] - reach, y[known] + reach, color="0.75", lw=3)
+    rows, known = np.arange(len(y)), np.isfinite(high - low)
+    ax.hlines(rows[known], low[known], high[known], color="0.75", lw=3)
     ax.plot(y, rows, "o", color=_FUNCTION, ms=5)
     ax.set_yticks(rows, labels)
     ax.set_ylim(len(y) - 0.5, -0.5)

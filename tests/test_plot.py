@@ -292,6 +292,28 @@ def test_errors_with_labels_in_a_new_figure(pyplot):
     assert len(pyplot.get_fignums()) == 1
 
 
+def test_errors_of_a_result(ax):
+    data = jnp.arange(20.0) + jax.random.normal(jax.random.key(1), (20,))
+    fun = lambda y, data: y["slope"] * jnp.arange(20.0) + y["offset"] - data
+    found = sd.least_squares(
+        fun,
+        {"offset": 0.5, "slope": 0.5},
+        data,
+        key=jax.random.key(0),
+        space={"offset": sd.Real(1.0, label="offset (mm)"), "slope": None},
+        max_steps=20,
+    )
+    sd.plot.errors(found, ax=ax)
+    assert [t.get_text() for t in ax.get_yticklabels()] == ["offset (mm)", "slope"]
+    low, high = found.parameter_intervals()
+    ends = [(row[0][0], row[1][0]) for row in ax.collections[0].get_segments()]
+    np.testing.assert_allclose(ends, [(low[k], high[k]) for k in ("offset", "slope")], rtol=1e-6)
+    with pytest.raises(ValueError, match="leave out stderrs"):
+        sd.plot.errors(found, found.y, ax=ax)
+    with pytest.raises(ValueError, match=r"only results of sd\.least_squares"):
+        sd.plot.errors(POINTS, ax=ax)
+
+
 def test_what_errors_refuses(ax):
     with pytest.raises(ValueError, match="1 standard errors for 2 values"):
         sd.plot.errors(np.ones(2), np.ones(1), ax=ax)

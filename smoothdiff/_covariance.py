@@ -1,0 +1,147 @@
+r"""The covariance of least-squares parameters, by a regression over evaluations near the answer.
+
+The residuals at the answer are modelled as $r + J u$ with errors that have two parts: one is the
+same for all evaluations, rounding, noise or jumps, and one grows with the square of the distance,
+curvature. The likelihood says how much there is of either, so that a linear function is fitted by
+all evaluations and a curved one by those nearby that rounding does not spoil. What the errors add
+to $J^T J$ is taken off again. A direction in which they may hide too much of it is not known.
+
+Source: own; the variances are estimated by restricted maximum likelihood (Patterson and Thompson,
+1971).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+# candidates for the distance at which both parts of the error are the same, and beyond the nearest
+# and the farthest evaluation by so many powers of e
+_GRID, _NEARER, _FARTHER = 24, 1, 3
+# columns that are the same but for so much are not told apart
+_RANK = 1e-10
+# The error of J by its length, squared, in a direction that counts as known. That of curvature has
+# a sign, so the root of it goes into the standard errors; that of noise is another for each
+# residual, and is taken off but for its chance.
+_CURVED, _NOISY = 0.01, 0.5
+# a parameter that takes less than this share in directions that are not known is known, and so is a
+# variance of which they have less
+_SHARE = 0.01
+# residuals at a time, in float64
+_CHUNK = 65536
+
+
+class Slopes(NamedTuple):
+    """What a regression tells of the slopes of the residuals.
+
+    `squares` is the sum over residuals of their slopes' products, and `noise` and `curved` what the
+    two parts of the errors add to it. `scale` is the unit of each parameter.
+    """
+
+    squares: Float[np.ndarray, "n n"]
+    noise: Float[np.ndarray, "n n"]
+    curved: Float[np.ndarray, "n n"]
+    scale: Float[np.ndarray, " n"]
+
+
+class Covariance(NamedTuple):
+    """The covariance, NaN where it is not known, and the degrees of freedom of its variance."""
+
+    matrix: Float[np.ndarray, "n n"]
+    freedom: int
+
+
+def slopes(
+    points: Float[np.ndarray, "M n"],
+    rows: Float[np.ndarray, "M P"],
+    here: int | None,
+) -> Slopes | None:
+    """Those at the point with this index; None without it, or if there are too few points."""
+    if here is None:
+        return None
+    away = points.astype(float) - points[here].astype(float)
+    scale = np.max(np.abs(away), axis=0)
+    # of a parameter that is the same in all of them nothing is known
+    moved, scale = scale > 0, np.where(scale > 0, scale, 1)
+    away, size = (away / scale)[:, moved], rows.shape[1]
+    gram = np.zeros((len(rows), len(rows)))
+    for start in range(0, size, _CHUNK):
+        part = rows[:, start : start + _CHUNK].astype(float)
+        part = part - part[here]
+        gram += part @ part.T
+    # no value is known better than to its last digit
+    rounding = np.finfo(rows.dtype).eps ** 2 * np.mean(rows[here].astype(float) ** 2)
+    least = max(rounding, np.finfo(float).tiny)
+    best, found = -np.inf, None
+    # curvature grows with the distance, by sigma or by what the residuals say
+    for distances in (np.sum(away**2, axis=1), np.diag(gram)):
+        some = np.log(distances[distances > 0])
+        if not len(some):
+            continue
+        for log in np.linspace(some.min() - _NEARER, some.max() + _FARTHER, _GRID):
+            curved = (distances / np.exp(log)) ** 2
+            likelihood, fit = _regression(gram, away, curved, size, least)
+            if likelihood > best:
+                best, found = likelihood, fit
+    if found is None:
+        return None
+    squares, noise, curved = (np.zeros((len(scale), len(scale))) for _ in found)
+    inside = np.ix_(moved, moved)
+    squares[inside], noise[inside], curved[inside] = found
+    noise[~moved, ~moved] = 1
+    return Slopes(squares, noise, curved, scale)
+
+
+def _regression(
+    gram: np.ndarray, away: np.ndarray, curved: np.ndarray, size: int, least: float
+) -> tuple[float, tuple[np.ndarray, np.ndarray, np.ndarray] | None]:
+    """The likelihood of errors of variance 1 + `curved`, but for a factor, and what they give."""
+    variance = 1 + curved
+    root = 1 / np.sqrt(variance)
+    design = np.concatenate([np.ones((len(away), 1)), away], axis=1) * root[:, None]
+    norm = np.linalg.norm(design, axis=0)
+    left, values, right = np.linalg.svd(design / norm, full_matrices=False)
+    freedom = len(away) - len(values)
+    if freedom < 1 or values[-1] <= _RANK * values[0]:
+        return -np.inf, None
+    weighted = gram * root[:, None] * root
+    rest = weighted - left @ (left.T @ weighted)
+    rest = rest - (rest @ left) @ left.T
+    factor = max(np.trace(rest) / (size * freedom), least)
+    logs = np.sum(np.log(variance)) + 2 * np.sum(np.log(values)) + 2 * np.sum(np.log(norm))
+    likelihood = -size / 2 * (freedom * np.log(factor) + logs)
+    inverse = ((right.T / values @ left.T) / norm[:, None] * root)[1:]
+    part = size * factor * inverse
+    return likelihood, (inverse @ gram @ inverse.T, part @ inverse.T, (part * curved) @ inverse.T)
+
+
+def covariance(
+    known: Slopes | None, residuals: int, squares: float, held: Bool[np.ndarray, " n"]
+) -> Covariance:
+    """Of the parameters that are not held, for so many residuals and the sum of their squares."""
+    n, free = len(held), np.flatnonzero(~held)
+    matrix, freedom = np.full((n, n), np.nan), residuals - len(free)
+    if known is None or freedom < 1 or not len(free):
+        return Covariance(matrix, freedom)
+    at = np.ix_(free, free)
+    errors = known.noise[at] + known.curved[at]
+    size = np.sqrt(np.diag(errors))
+    # directions in which errors are independent, and as large as one
+    lower = np.linalg.cholesky(errors / size / size[:, None])
+    back = np.linalg.inv(lower).T / size[:, None]
+    signal, turn = np.linalg.eigh(back.T @ known.squares[at] @ back)
+    directions = back @ turn
+    share = np.einsum("ik,ij,jk->k", directions, known.curved[at], directions)
+    none = signal <= 1 / _NOISY
+    told = ~none & (signal > (share + (1 - share) / residuals) / _CURVED)
+    part = directions[:, told]
+    inner = part / (signal[told] - 1) @ part.T * (squares / freedom)
+    # where there is no signal the parameters are taken as they are, where there is too little not
+    moves = np.sum((directions[:, none] * size[:, None]) ** 2, axis=1)
+    variances = directions**2 / np.maximum(signal, 1)
+    adds = np.sum(variances[:, ~none & ~told], axis=1)
+    unknown = (moves > _SHARE) | (adds > _SHARE * np.sum(variances[:, told], axis=1))
+    inner[unknown] = inner[:, unknown] = np.nan
+    unit = known.scale[free]
+    matrix[at] = inner * unit * unit[:, None]
+    return Covariance(matrix, freedom)
