@@ -115,25 +115,32 @@ def black_box(
     host = HostFunction(fun, name, batched, executor, on_error, on_nonfinite, retries, timeout)
     _check(host)
     promised = None if out is None else _jax_function(host, Outputs.like(out))
-    found: dict[Any, Callable[..., Any]] = {}
+    found = _Found()
 
     @functools.wraps(fun)
     def box(*args):
         args = jax.tree.map(_array, args)
         leaves, tree = jax.tree.flatten(args)
         shapes = tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves)
-        call = promised or found.get((tree, shapes))
+        call = promised or found.calls.get((tree, shapes))
         if call is None:
             if not all(map(is_concrete, leaves)):
                 raise UnknownOutputError(_unknown(name, tree.unflatten(shapes)))
             result, outputs = _first(host, leaves, tree)
-            found[tree, shapes] = _jax_function(host, outputs)
+            found.calls[tree, shapes] = _jax_function(host, outputs)
             return result
         # Outside of jit the error is ours to raise; while jit traces, neither line does anything.
         with reraise():
             return jax.block_until_ready(call(*args))
 
     return box
+
+
+@dataclasses.dataclass
+class _Found:
+    """The JAX function for each structure of arguments that was met; says nothing of the values."""
+
+    calls: dict[Any, Callable[..., Any]] = dataclasses.field(default_factory=dict, compare=False)
 
 
 def _jax_function(host: HostFunction, outputs: Outputs) -> Callable[..., Any]:

@@ -1,9 +1,7 @@
 """A run on disk: a pytree of arrays in one .npz file, tied to the problem that it belongs to."""
 
-import hashlib
 import json
 import os
-import re
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -13,19 +11,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from smoothdiff._digest import differing, listed, parts
+
 
 class Checkpoint:
     """Where a run is kept, and what must be the same when it is taken up again."""
 
-    def __init__(self, path: str | os.PathLike, **problem: PyTree):
-        """Names the file, whose directory is created, and the pytrees that make up the problem.
+    def __init__(self, path: str | os.PathLike, **problem: Any):
+        """Names the file, whose directory is created, and the values that make up the problem.
 
-        In these, numbers, arrays and strings count by value and functions by name; what a function
-        closes over cannot be seen.
+        What counts in these is said at `parts`. What changes while the run goes on, such as a list
+        to which the function appends, is no part of the problem. What else can change in place, and
+        `fun` uses it, is for the caller to judge: `doubtful` has the parts that differ.
         """
+        self.doubtful: set[str] = set()
         self._path = Path(path)
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        self._problem = {name: _digest(tree) for name, tree in problem.items()}
+        self._problem = problem
+        self._parts: dict[str, str | None] = {**parts(**problem)}
 
     def load(self, like: PyTree) -> PyTree | None:
         """What was saved, with the structure and dtypes of `like`; None if there is no file.
@@ -37,23 +40,30 @@ class Checkpoint:
             return None
         try:
             with self._path.open("rb") as opened, np.load(opened) as file:
-                problem = json.loads(str(file["problem"]))
+                kept = json.loads(str(file["problem"]))
                 arrays = [file[str(i)] for i in range(len(file.files) - 1)]
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise ValueError(f"{self._path} is not a checkpoint: name another file") from error
-        other = sorted(name for name in self._problem if self._problem[name] != problem.get(name))
-        if other:
-            raise ValueError(
-                f"the checkpoint {self._path} was written for another problem: its "
-                f"{', '.join(other)} differed. Name another file, delete this one, or make the "
-                "call as it was"
-            )
+        differ = differing(kept, self._parts)
+        self.doubtful = {name for name in differ if name.startswith("fun") and ":" in name}
+        if differ > self.doubtful:
+            raise self.other(f"its {listed(differ)} differed")
+        self._parts = kept
         leaves, treedef = jax.tree.flatten(like)
         return treedef.unflatten(map(_restore, arrays, leaves))
 
+    def other(self, how: str) -> ValueError:
+        """The error that the file is of another problem, and how it is known."""
+        return ValueError(
+            f"the checkpoint {self._path} was written for another problem: {how}. Name another "
+            "file, delete this one, or make the call as it was"
+        )
+
     def save(self, tree: PyTree) -> None:
         """Replaces the file; a crash in the middle of it leaves the old one."""
-        arrays: dict[str, Any] = {"problem": np.asarray(json.dumps(self._problem))}
+        for name in differing(self._parts, parts(**self._problem)):
+            self._parts[name] = None
+        arrays: dict[str, Any] = {"problem": np.asarray(json.dumps(self._parts))}
         arrays |= {str(i): _numpy(leaf) for i, leaf in enumerate(jax.tree.leaves(tree))}
         part = self._path.with_name(f"{self._path.name}.{os.getpid()}.part")
         try:
@@ -77,22 +87,3 @@ def _restore(array: np.ndarray, like: Any) -> Any:
         return jax.random.wrap_key_data(jnp.asarray(array), impl=jax.random.key_impl(like))
     # NumPy saves the bits of bfloat16 and its like, but not their names
     return array.view(like.dtype) if array.dtype.kind == "V" else array
-
-
-def _digest(tree: PyTree) -> str:
-    """A short text that changes with the structure of a pytree and with every value in it."""
-    leaves, treedef = jax.tree.flatten(tree)
-    # the same program has other addresses when it runs again
-    digest = hashlib.blake2b(re.sub(r" at 0x[0-9a-f]+", "", str(treedef)).encode(), digest_size=16)
-    for leaf in leaves:
-        digest.update(_bytes(leaf))
-    return digest.hexdigest()
-
-
-def _bytes(leaf: Any) -> bytes:
-    if isinstance(leaf, jax.Array | np.ndarray | np.generic):
-        array = _numpy(leaf)
-        return f"{array.dtype}{array.shape}".encode() + array.tobytes()
-    if callable(leaf):
-        return getattr(leaf, "__qualname__", type(leaf).__qualname__).encode()
-    return repr(leaf).encode()

@@ -116,11 +116,12 @@ class HostFunction:
     fun: Callable[..., Any]
     name: str
     batched: bool
-    executor: concurrent.futures.Executor | None
+    # where and how often it is tried says nothing of its values
+    executor: concurrent.futures.Executor | None = dataclasses.field(compare=False)
     on_error: str
     on_nonfinite: str
-    retries: int
-    timeout: int | float | None
+    retries: int = dataclasses.field(compare=False)
+    timeout: int | float | None = dataclasses.field(compare=False)
 
     def __call__(self, samples: Samples, outs: Sequence[np.ndarray], out_tree: Any) -> None:
         """Evaluates all samples and writes the results into `outs`, one row per sample."""

@@ -97,7 +97,9 @@ def minimise(
         checkpoint: a file that keeps the run. The same call takes up the run that it finds there
             and ends with the same result as if there had been no interruption; with a larger
             `max_steps` or `max_evaluations` it goes on. Written as often as is cheap, and at the
-            end, whatever ended the run.
+            end, whatever ended the run. A run is taken up only if the call is the same, numbers and
+            code included, and if `fun` gives the same value again at the lowest point, an
+            evaluation that is not counted.
 
     Returns:
         A `Result`.
@@ -241,9 +243,9 @@ def _run(
             problem = HostProblem.of(fun, solver, args, options, y)
         state = _first_state(problem, y, check)
     run = Run(problem, y, state, units, _keeps(loop.keep_iterates, y))
-    if loop.checkpoint is not None:
-        run.attach(loop.checkpoint)
     try:
+        if loop.checkpoint is not None:
+            run.attach(loop.checkpoint)
         with tqdm(total=ends.expected, initial=run.steps, disable=not loop.progress) as bar:
             compiled = set()
             while (reason := run.done() or run.reached(ends)) is None:

@@ -1,6 +1,7 @@
 """One run of a solver on the host: compiled steps, their history, and what is returned or kept."""
 
 import dataclasses
+import math
 import operator
 import os
 import time
@@ -16,6 +17,7 @@ from jaxtyping import Array, Bool, PyTree
 
 from smoothdiff._black_box import reraise
 from smoothdiff._checkpoint import Checkpoint
+from smoothdiff._digest import listed
 from smoothdiff._limits import Limits
 from smoothdiff._parameter_errors import Answer
 from smoothdiff._result import MinimiseError, Record, Result
@@ -120,8 +122,8 @@ class Run:
     def attach(self, path: str | os.PathLike) -> None:
         """Keeps the run in a file from now on, and takes up the one that is already there."""
         problem = self.problem
-        shapes = jax.tree.map(lambda a: f"{a.dtype}{a.shape}", self.state)
-        self.file = Checkpoint(
+        shapes = tuple(f"{leaf.dtype}{leaf.shape}" for leaf in jax.tree.leaves(self.state))
+        file = Checkpoint(
             path,
             fun=problem.fun,
             y0=self.y,
@@ -131,11 +133,41 @@ class Run:
             **({"bounds": None} | problem.options),
         )
         iterate = self.units.natural(self.y) if self.keep_iterates else None
-        saved = self.file.load((self.y, self.state, Record(0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, iterate)))
+        saved = file.load((self.y, self.state, Record(0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, iterate)))
         if saved is not None:
             self.y, self.state = jax.tree.map(jnp.asarray, saved[:2])
             self.history = _unstack(saved[2])
             self.start -= self.history[-1].seconds
+            self._check_function(file)
+        self.file = file
+
+    def _check_function(self, file: Checkpoint) -> None:
+        """Raises ValueError if the function is no longer what it was at the lowest point.
+
+        This takes an evaluation; if the value is another one, two more. If these differ again, the
+        function has noise, and nothing is known.
+        """
+        there, before = self.state.progress.lowest_y, self.state.progress.lowest_fun.item()
+        now = self._fun(there)
+        seen = now, before, *(value for r in self.history for value in (r.fun, r.smoothed))
+        scale = max((abs(value) for value in seen if math.isfinite(value)), default=0.0)
+        near = math.sqrt(jnp.finfo(self.state.progress.lowest_fun.dtype).eps) * scale
+        if abs(now - before) <= near:
+            return
+        if math.isfinite(now - before) and all(self._fun(there) == now for _ in range(2)):
+            raise file.other(f"fun at its lowest point is {now:.6g}, and was {before:.6g}")
+        if file.doubtful:
+            raise file.other(f"its {listed(file.doubtful)} differed")
+
+    def _fun(self, y: PyTree) -> float:
+        """The function, or half the sum of squares of residuals."""
+        with reraise():
+            leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(self.problem.value(y))]
+        solver = self.problem.solver
+        solver = solver.ours() if isinstance(solver, Wrapped) else solver
+        if isinstance(solver, optx.AbstractLeastSquaresSolver):
+            return float(sum(np.sum(leaf * leaf) for leaf in leaves)) / 2
+        return float(leaves[0])
 
     def save(self) -> None:
         if self.file is None or self.steps == 0:

@@ -378,6 +378,137 @@ def test_the_checkpoint_of_another_problem_is_refused(name, change, path):
     assert path.read_bytes() == before
 
 
+def shifted(by):
+    return lambda y, target: jnp.sum(jnp.floor(8 * jnp.abs(y - target - by)))
+
+
+ALIKE = {
+    "closure": (shifted(0.0), shifted(0.5)),
+    "partial": (
+        functools.partial(lambda y, target, by: jnp.sum(jnp.abs(y - by)), by=0.1),
+        functools.partial(lambda y, target, by: jnp.sum(jnp.abs(y - by)), by=0.2),
+    ),
+    "lambda": (lambda y, target: jnp.sum(y**2), lambda y, target: jnp.sum(y**4)),
+    "black box": (sd.black_box(shifted(0.0), 0.0), sd.black_box(shifted(0.5), 0.0)),
+}
+
+
+@pytest.mark.parametrize("name", ALIKE)
+def test_another_function_of_the_same_name_is_refused(name, path):
+    one, other = ALIKE[name]
+    run = lambda fun: sd.minimise(
+        fun, Y0, np.zeros(2, np.float32), key=KEY, solver=ADAM, max_steps=1, checkpoint=path
+    )
+    run(one)
+    with pytest.raises(ValueError, match=r"another problem: its fun\b"):
+        run(other)
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (optax.adam(0.05), optax.adam(0.5)),
+        (optax.adam(0.05), optax.adam(0.05, b1=0.8)),
+        (optax.sgd(SCHEDULE), optax.sgd(optax.linear_schedule(0.3, 0.2, 100))),
+    ],
+)
+def test_other_numbers_of_optax_are_refused(one, other, path):
+    run = lambda adam: sd.minimise(
+        waves, Y0, TARGET, key=KEY, solver=sd.FirstOrder(adam, 0.2), max_steps=1, checkpoint=path
+    )
+    run(one)
+    with pytest.raises(ValueError, match=r"another problem: its solver\.optim\."):
+        run(other)
+
+
+def test_what_the_function_itself_changes_is_no_part_of_the_problem(path):
+    seen, cache = [], {}
+
+    def host(y):
+        seen.append(y)
+        cache[len(seen)] = y
+        return np.sum(np.floor(8 * np.abs(y)))
+
+    box = sd.black_box(host, 0.0)
+    run = functools.partial(sd.minimise, lambda y, args: box(y), Y0, key=KEY, solver=ADAM)
+    whole = run(max_steps=4)
+    for steps in (2, 4):
+        seen.clear()
+        assert_same(
+            run(max_steps=steps, checkpoint=path), whole if steps == 4 else run(max_steps=2)
+        )
+    # of the steps that were left, of the judgement, and at the lowest point
+    assert len(seen) == 2 * N + JUDGING + 1
+    cache.clear()
+    assert_same(run(max_steps=4, checkpoint=path), whole)
+
+
+class Hidden:
+    """Returns what no digest can see."""
+
+    def __init__(self, values):
+        self.values = values
+
+    def __reduce__(self):
+        raise TypeError("no pickle")
+
+    def __call__(self, y, args):
+        return self.values(y)
+
+
+@pytest.mark.parametrize("solver", [ADAM, sd.NewtonCG(0.2)], ids=["adam", "newton"])
+def test_a_function_with_other_values_is_refused_whatever_the_digest_says(solver, path):
+    run = functools.partial(sd.minimise, y0=Y0, key=KEY, solver=solver, max_steps=3)
+    square = lambda y: jnp.sum((y - 1) ** 2)
+    first = run(Hidden(square), checkpoint=path)
+    with pytest.raises(
+        ValueError, match=r"another problem: fun at its lowest point is .*, and was"
+    ):
+        run(Hidden(lambda y: jnp.sum(jnp.abs(y))), checkpoint=path)
+    # rounded otherwise it is the same
+    run(Hidden(lambda y: jnp.sum(y * y - 2 * y + 1)), checkpoint=path)
+    again = run(Hidden(square), checkpoint=path)
+    np.testing.assert_array_equal(again.y, first.y)
+    assert (again.fun, again.evaluations) == (first.fun, first.evaluations)
+
+
+def test_a_function_with_noise_is_taken_up_unless_its_state_differs(path):
+    random, settings = np.random.default_rng(0), {"samples": 4}
+    box = sd.black_box(lambda y: np.sum(np.abs(y)) + random.standard_normal(), 0.0)
+    fun = lambda y, args: box(y) * settings["samples"]
+    run = functools.partial(sd.minimise, fun, Y0, key=KEY, solver=ADAM, checkpoint=path)
+    run(max_steps=2)
+    assert run(max_steps=3).history[-1].step == 3
+    settings["samples"] = 8
+    with pytest.raises(ValueError, match=r"another problem: its fun\.settings differed"):
+        run(max_steps=4)
+
+
+def test_a_nan_where_the_function_was_finite_is_no_verdict(path):
+    calls = []
+
+    def host(y):
+        calls.append(y)
+        return np.sum(np.abs(y)) if len(calls) <= 2 * N + JUDGING else np.nan
+
+    box = sd.black_box(host, 0.0, on_nonfinite="nan")
+    run = functools.partial(sd.minimise, lambda y, args: box(y), Y0, key=KEY, solver=ADAM)
+    run(max_steps=2, checkpoint=path)
+    with pytest.raises(sd.MinimiseError, match="NaN") as caught:
+        run(max_steps=3, checkpoint=path)
+    assert caught.value.result.history[-1].step == 2
+
+
+def test_a_failure_of_the_function_while_a_checkpoint_is_compared_loses_nothing(host, path):
+    run = functools.partial(sd.minimise, host_plateaus, Y0, NO_EDGE, key=KEY, solver=ADAM)
+    run(max_steps=2, checkpoint=path)
+    host.at, host.error = host.count + 1, OverflowError("too bright")
+    with pytest.raises(sd.MinimiseError, match="too bright") as caught:
+        run(max_steps=4, checkpoint=path)
+    assert len(caught.value.result.history) == 2
+    assert_same(run(max_steps=4, checkpoint=path), run(max_steps=4))
+
+
 @pytest.mark.parametrize("content", [b"", b"not a run", b"PK\x03\x04 broken"])
 def test_a_file_that_is_no_checkpoint_is_refused(content, tmp_path):
     path = tmp_path / "notes.txt"
