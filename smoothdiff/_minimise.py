@@ -99,7 +99,7 @@ def minimise(
             `max_steps` or `max_evaluations` it goes on. Written as often as is cheap, and at the
             end, whatever ended the run. A run is taken up only if the call is the same, numbers and
             code included, and if `fun` gives the same value again at the lowest point, an
-            evaluation that is not counted.
+            evaluation that is not counted. Where it cannot be written, a warning says so.
 
     Returns:
         A `Result`.

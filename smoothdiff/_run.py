@@ -5,6 +5,7 @@ import math
 import operator
 import os
 import time
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -170,11 +171,16 @@ class Run:
         return float(leaves[0])
 
     def save(self) -> None:
+        """Writes the file, if there is one; what was computed is never lost for a full disk."""
         if self.file is None or self.steps == 0:
             return
         before = time.monotonic()
         history = jax.tree.map(lambda *leaves: np.stack(leaves), *self.history[: self.steps])
-        self.file.save((self.y, self.state, history))
+        try:
+            self.file.save((self.y, self.state, history))
+        except Exception as error:
+            text = f"the checkpoint was not saved, the run goes on: {type(error).__name__}: {error}"
+            warnings.warn(text, RuntimeWarning, stacklevel=2)
         after = time.monotonic()
         self.save_due = after + (after - before) / _SAVING
 

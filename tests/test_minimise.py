@@ -1,6 +1,8 @@
 """The host loop: its iterates, its budget, what it returns, and how it survives interruptions."""
 
+import errno
 import functools
+import shutil
 
 import jax
 import jax.numpy as jnp
@@ -376,6 +378,37 @@ def test_the_checkpoint_of_another_problem_is_refused(name, change, path):
     with pytest.raises(ValueError, match=rf"another problem: its [\w, ]*\b{name}\b"):
         sd.minimise(**{**call, **change}, checkpoint=path)
     assert path.read_bytes() == before
+
+
+def disk_full(path, monkeypatch):
+    def savez(file, **arrays):
+        file.write(b"some of it")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("smoothdiff._checkpoint.np.savez", savez)
+
+
+def directory_gone(path, monkeypatch):
+    shutil.rmtree(path.parent)
+
+
+def directory_is_a_file(path, monkeypatch):
+    shutil.rmtree(path.parent)
+    path.parent.write_text("")
+
+
+@pytest.mark.parametrize("fault", [disk_full, directory_gone, directory_is_a_file])
+def test_a_save_that_fails_warns_and_the_run_goes_on(fault, path, monkeypatch):
+    run = functools.partial(sd.minimise, waves, Y0, TARGET, key=KEY, solver=ADAM, max_steps=4)
+    broken = lambda record: fault(path, monkeypatch) if record.step == 2 else None
+    with pytest.warns(RuntimeWarning, match=r"not saved, the run goes on: .*(space|No such|dir)"):
+        result = run(checkpoint=path, callback=broken)
+    assert_same(result, run())
+    if fault is disk_full:
+        monkeypatch.undo()
+        # the file of an earlier step is whole, and nothing lies beside it
+        assert_same(run(checkpoint=path), result)
+        assert [p.name for p in path.parent.iterdir()] == ["run.npz"]
 
 
 def shifted(by):
