@@ -145,8 +145,9 @@ def there(run: dict[str, Any], lowest: float) -> float:
 
 def line(name: str, title: str, solver: str, took: dict[Any, list[float]]) -> dict[str, Any]:
     """Medians of the shortest call and of the best setting, and their ratio from each start."""
-    best = min(FACTORS, key=lambda factor: (np.median(took[factor]), np.mean(took[factor])))
+    best = min(FACTORS, key=lambda factor: (np.median(took[factor]), float(np.mean(took[factor]))))
     found = {"shortest": quartiles(took[None]), "best": quartiles(took[best]), "factor": best}
+    ratio = float(np.median(took[None]) / np.median(took[best]))
     solved = {
         "shortest": sum(map(np.isfinite, took[None])),
         "best": sum(map(np.isfinite, took[best])),
@@ -155,7 +156,7 @@ def line(name: str, title: str, solver: str, took: dict[Any, list[float]]) -> di
         "name": name,
         "title": title,
         "solver": solver,
-        "ratio": found["shortest"]["median"] / found["best"]["median"],
+        "ratio": ratio if np.isfinite(ratio) else None,
         "solved": {key: int(number) for key, number in solved.items()},
         "took": {str(factor): values for factor, values in took.items()},
     } | found
