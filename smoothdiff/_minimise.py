@@ -58,7 +58,8 @@ def minimise(
     Without a solver it is `NewtonCG(sigma)`, and from 100 parameters on `FirstOrder` with Adam,
     whose steps are 0.15 sigma. Without a sigma it is a fifth of a parameter's range if it has one,
     else a fifth of the largest number of its leaf of y0, or 0.2 if that is zero. `NewtonCG` needs
-    no more than the order of magnitude.
+    no more than the order of magnitude: where all of its first points have the same value, others
+    follow up to a thousand sigma away, and the first ones again where these found a change.
 
     The iterates are, but for rounding, those of `optimistix.minimise(fun, solver, y0, args,
     options={"key": key})`, with `"bounds": bounds` in the options if there are any. With fewer than

@@ -34,6 +34,11 @@ class FirstPoints(eqx.Module):
         left = jnp.full(len(theta) + 1, _TRIES, jnp.int32)
         return FirstPoints(jnp.ones_like(theta), left, jnp.asarray(jnp.inf, theta.dtype))
 
+    def widened(self, width: Float[Array, ""], fun: Float[Array, ""]) -> "FirstPoints":
+        """All parameters again, at steps so many times as long, from a point with this loss."""
+        left = jnp.full_like(self.left, _TRIES).at[0].set(0)
+        return FirstPoints(width * self.reach, left, fun)
+
     def done(self) -> Bool[Array, ""]:
         """Whether no point is left."""
         return jnp.all(self.left == 0)

@@ -11,10 +11,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
 from smoothdiff._solvers._history import History
+from smoothdiff._solvers._pilot import PAIRS, Pilot
 
-# what is evaluated next: the first points, a step of the local model, samples around a center, or
-# points along a parameter
-FIRST, TRUST, WIDE, SCAN = 0, 1, 2, 3
+# what is evaluated next: the first points, a step of the local model, samples around a center,
+# points further and further away, or points along a parameter
+FIRST, TRUST, WIDE, PILOT, SCAN = 0, 1, 2, 3, 4
 # so many small steps in a row count as convergence
 _SMALL = 3
 # a width of so many roundings of sigma is nothing
@@ -36,6 +37,9 @@ class Sizes(NamedTuple):
 class AbstractPointSearch(eqx.Module):
     """Where a search stands: all that was evaluated, and what comes next.
 
+    Where the first points are all the same, the `pilot` follows, and the first points again, as far
+    away as it found something else.
+
     `evaluated` counts the evaluations, `small` the small steps in a row, `stale` the evaluations
     since the last lower point.
     """
@@ -46,6 +50,13 @@ class AbstractPointSearch(eqx.Module):
     evaluated: Int[Array, ""]
     small: Int[Array, ""]
     stale: Int[Array, ""]
+    pilot: Pilot
+
+    @abc.abstractmethod
+    def widened(
+        self, params: Params, theta: Float[Array, " n"], width: Float[Array, ""]
+    ) -> "AbstractPointSearch":
+        """The same search before its first points, so many sigmas from a point that is known."""
 
     @abc.abstractmethod
     def again(
@@ -141,13 +152,50 @@ class AbstractPointSearch(eqx.Module):
         away = jnp.max(jnp.abs(self.history.points - point[None]), axis=1)
         return jnp.any(self.history.valid & (self.history.funs == fun) & (away > reach))
 
+    def piloting(self) -> Any:
+        """With the pilot next, if the first points are over and all evaluations are the same."""
+        rows, valid = self.history.rows, self.history.valid
+        same = jnp.all((rows == rows[jnp.argmax(valid)][None]) | ~valid[:, None])
+        stage = jnp.full_like(self.stage, PILOT)
+        flat = eqx.tree_at(lambda s: (s.stage, s.pilot.follows), self, (stage, self.stage))
+        return where(same & (self.stage != FIRST) & self.pilot.left(), flat, self)
+
+    def pilot_points(
+        self, params: Params, draw: Callable[[int], Float[Array, "k n"]], count: int
+    ) -> Float[Array, "K n"]:
+        """The next points of the pilot."""
+        return self.start[None] + params.sigma[None] * self.pilot.steps(draw(PAIRS), count)
+
+    def piloted(self, params: Params, new: History) -> Any:
+        """After these points of the pilot: the first points again, or what would have followed."""
+        steps = (new.points - self.start[None]) / params.sigma[None]
+        row = self.history.rows[jnp.argmax(self.history.valid)]
+        changed = jnp.any(new.rows != row[None], axis=1)
+        pilot = self.pilot.after(steps, changed, new.valid)
+        stage = jnp.where(pilot.left(), self.stage, pilot.follows)
+        more = eqx.tree_at(lambda s: (s.stage, s.pilot), self, (stage, pilot))
+        # of the first points the start is known
+        one = jnp.full_like(self.evaluated, 1 - len(steps))
+        widened = more.widened(params, self.iterate(), pilot.length)
+        widened = eqx.tree_at(lambda s: s.evaluated, widened, one)
+        return where(pilot.length > 0, widened, more)
+
     def is_local(self) -> Bool[Array, ""]:
         """Whether a step within the trust region comes next."""
         return self.stage == TRUST
 
+    def is_bold(self) -> Bool[Array, ""]:
+        """Whether the next points may be anything, since nobody asked for them."""
+        return self.is_local() | (self.stage == PILOT)
+
     def iterate(self) -> Float[Array, " n"]:
         """The best point."""
         return self.history.best(self.start)[0]
+
+
+def where(condition: Bool[Array, ""], a: Any, b: Any) -> Any:
+    """One of two pytrees."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), a, b)
 
 
 def by_stage(

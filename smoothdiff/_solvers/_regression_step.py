@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 from smoothdiff._params import Params
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._noisy_step import Trust, outcome, propose, revise
+from smoothdiff._solvers._point_search import Sizes, nothing
 from smoothdiff._solvers._scalar_fit import ScalarFit, fit
 
 # how strongly the noise of the Hessian's eigenvalues counts in the metric
@@ -42,6 +43,11 @@ class Center(eqx.Module):
         still = jnp.zeros_like(trust.reduction), jnp.zeros_like(trust.stall)
         trust = eqx.tree_at(lambda t: (t.reduction, t.stall), trust, still)
         return Center(theta, theta, self.metric, trust)
+
+    def lost(self, sizes: Sizes) -> Bool[Array, ""]:
+        """Whether rounds led nowhere for too long, or have no width any more."""
+        trust = self.trust
+        return (trust.stall * sizes.first >= sizes.patience) | nothing(trust.width)
 
     def sample(self, params: Params, z: Float[Array, " n"]) -> Float[Array, " n"]:
         """The sample for a standard normal point, within the bounds."""

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from smoothdiff._params import Params
 from smoothdiff._solvers._first_points import FirstPoints
 from smoothdiff._solvers._history import History
+from smoothdiff._solvers._pilot import Pilot
 from smoothdiff._solvers._point_search import (
     FIRST,
     TRUST,
@@ -25,6 +26,7 @@ from smoothdiff._solvers._point_search import (
     AbstractPointSearch,
     Sizes,
     by_stage,
+    where,
 )
 from smoothdiff._solvers._residual_trust import Proposal, TrustRegion
 from smoothdiff._solvers._wide_rounds import Wide, further, sides_of
@@ -58,6 +60,7 @@ class ResidualSearch(AbstractPointSearch):
             wide=Wide.start(theta, jnp.zeros(size, theta.dtype), one),
             small=none,
             stale=none,
+            pilot=Pilot.start(theta),
         )
 
     def again(
@@ -72,6 +75,14 @@ class ResidualSearch(AbstractPointSearch):
         empty = jax.tree.map(jnp.zeros_like, self.history)
         anew = ResidualSearch.of(theta, empty)
         return eqx.tree_at(lambda s: s.wide.rounds, anew, self.wide.rounds + 1)
+
+    def widened(
+        self, params: Params, theta: Float[Array, " n"], width: Float[Array, ""]
+    ) -> "ResidualSearch":
+        """With longer steps along the parameters, from a point that is known."""
+        first = self.first.widened(width, self.history.best(theta)[2])
+        stage = jnp.full_like(self.stage, FIRST)
+        return eqx.tree_at(lambda s: (s.stage, s.start, s.first), self, (stage, theta, first))
 
     def settled(self) -> Bool[Array, ""]:
         """The local model's may be none."""
@@ -152,7 +163,8 @@ class ResidualSearch(AbstractPointSearch):
             points = jnp.where(((at == 1) & worth)[:, None], (wide.center + step)[None], points)
             return jnp.where((at == 0)[:, None], wide.center[None], points), nothing
 
-        return by_stage(self.stage, stage, [first, local, wide])
+        pilot = lambda: (self.pilot_points(params, draw, count), nothing)
+        return by_stage(self.stage, stage, [first, local, wide, pilot])
 
     def after(
         self,
@@ -167,9 +179,10 @@ class ResidualSearch(AbstractPointSearch):
         here = self.history.best(self.start)
         with_rows = self.kept(new)
         branches = [
-            lambda: with_rows._after_first(jnp.where(new.valid, new.funs, jnp.inf)),
+            lambda: with_rows._after_first(jnp.where(new.valid, new.funs, jnp.inf)).piloting(),
             lambda: with_rows._after_local(here[1], new.rows, new.valid, proposal),
             lambda: with_rows._after_wide(params, new.rows, new.valid, sizes),
+            lambda: with_rows.piloted(params, new),
         ]
         return by_stage(self.stage, stage, branches)
 
@@ -190,7 +203,7 @@ class ResidualSearch(AbstractPointSearch):
         _, row, _ = self.history.best(self.start)
         moved = jnp.any(self.history.rows != row[None], axis=1) & self.history.valid
         few = 2 * (1 + jnp.sum(moved)) <= jnp.sum(self.history.valid)
-        return _where(first.done() & few, known._to_wide(jnp.ones_like(self.wide.scale)), known)
+        return where(first.done() & few, known._to_wide(jnp.ones_like(self.wide.scale)), known)
 
     def _after_local(
         self, row: Array, rows: Array, good: Array, proposal: Proposal
@@ -198,7 +211,7 @@ class ResidualSearch(AbstractPointSearch):
         trust = self.trust.revise(proposal, row, rows, good)
         local = eqx.tree_at(lambda s: s.trust, self, trust)
         scale = jnp.maximum(self.wide.scale, 1)
-        return _where(trust.failed(), local._to_wide(scale), local)
+        return where(trust.failed(), local._to_wide(scale), local)
 
     def _after_wide(
         self, params: Params, rows: Array, good: Array, sizes: Sizes
@@ -240,8 +253,4 @@ class ResidualSearch(AbstractPointSearch):
         )
         stage = jnp.full_like(self.stage, TRUST)
         back = eqx.tree_at(lambda s: (s.stage, s.trust), self, (stage, trust))
-        return _where(came_true | (idle >= _IDLE * (len(self.start) + 1)), back, search)
-
-
-def _where(condition: Array, a: ResidualSearch, b: ResidualSearch) -> ResidualSearch:
-    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
+        return where(came_true | (idle >= _IDLE * (len(self.start) + 1)), back, search)

@@ -6,8 +6,8 @@ where the function is smooth. The other is a regression over samples around a ce
 wins where the function is rough. Whichever lowers the function faster goes on.
 """
 
+import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -20,6 +20,7 @@ from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import differ
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._parameter_scan import Scan, bounded, bounds_of
+from smoothdiff._solvers._pilot import Pilot
 from smoothdiff._solvers._point_search import (
     FIRST,
     SCAN,
@@ -28,7 +29,7 @@ from smoothdiff._solvers._point_search import (
     AbstractPointSearch,
     Sizes,
     by_stage,
-    nothing,
+    where,
 )
 from smoothdiff._solvers._quadratic_trust import Proposal, QuadraticTrust
 from smoothdiff._solvers._regression_step import Center
@@ -81,6 +82,7 @@ class ValueSearch(AbstractPointSearch):
             evaluated=none,
             small=none,
             stale=none,
+            pilot=Pilot.start(theta),
             steps=width * sigma,
             scan=Scan.start(theta, never, sigma) if bounded(params) else None,
             searches=none,
@@ -115,12 +117,24 @@ class ValueSearch(AbstractPointSearch):
             # where parameters act alone, a longer scan is the best that can follow
             scan, longer = Scan.start(*lowest, params.sigma), self.scan.again(*lowest)
             more = self.scan.done() & ~longer.failed
-            anew = eqx.tree_at(lambda s: s.scan, anew, _where(more, longer, scan))
+            anew = eqx.tree_at(lambda s: s.scan, anew, where(more, longer, scan))
             closed = jnp.all(jnp.isfinite(jnp.stack(bounds_of(params))))
             scans = (more | (searches == 1)) & closed
             stage = jnp.where(scans, SCAN, stage).astype(stage.dtype)
         changed = stage, self.rounds + 1, searches, self.noisy
         return eqx.tree_at(lambda s: (s.stage, s.rounds, s.searches, s.noisy), anew, changed)
+
+    def widened(
+        self, params: Params, theta: Float[Array, " n"], width: Float[Array, ""]
+    ) -> "ValueSearch":
+        """With all first points again."""
+        return self._anew(params, theta, params.sigma, width)
+
+    def _anew(self, params: Params, theta: Array, sigma: Array, width: Array) -> "ValueSearch":
+        """The same search from another point, with all that was evaluated."""
+        kept = {n: getattr(self, n) for n in ("pilot", "searches", "rounds", "noisy", "scan")}
+        anew = ValueSearch.of(params, theta, sigma, width, self.history)
+        return dataclasses.replace(anew, **kept)
 
     def settled(self) -> Bool[Array, ""]:
         """The local model's may be none."""
@@ -128,7 +142,7 @@ class ValueSearch(AbstractPointSearch):
 
     def over(self, sizes: Sizes) -> Bool[Array, ""]:
         """Whether neither model leads anywhere; after one converged the wide one may yet."""
-        lost = _lost(self.center, sizes) & (self.trust.failed() | self._later())
+        lost = self.center.lost(sizes) & (self.trust.failed() | self._later())
         return lost if self.scan is None else lost | self.scan.failed
 
     def _patient(self, searches: Int[Array, ""]) -> Bool[Array, ""]:
@@ -193,7 +207,8 @@ class ValueSearch(AbstractPointSearch):
             best, *_ = self.history.best(self.start)
             return points.at[0].set(jnp.where(self._checks(), best, points[0])), nothing
 
-        branches = [first, local, wide]
+        further = lambda: (self.pilot_points(params, draw, count), nothing)
+        branches = [first, local, wide, further]
         if (scan := self.scan) is not None:
             branches.append(lambda: (scan.propose(*bounds_of(params), count), nothing))
         return by_stage(self.stage, stage, branches)
@@ -215,7 +230,7 @@ class ValueSearch(AbstractPointSearch):
             enough = self.evaluated + sizes.step > 2 * len(self.start)
             stage = jnp.where(enough, TRUST, FIRST).astype(self.stage.dtype)
             turn = Turn.start(len(self.start), known.history.best(self.start)[2])
-            return eqx.tree_at(lambda s: (s.stage, s.turn), known, (stage, turn))
+            return eqx.tree_at(lambda s: (s.stage, s.turn), known, (stage, turn)).piloting()
 
         def local() -> "ValueSearch":
             trust = self.trust.revise(proposal, before, new.funs, new.valid)
@@ -228,7 +243,7 @@ class ValueSearch(AbstractPointSearch):
             full = lambda: more._stepped(params)._turned(sizes)
             return jax.lax.cond(taken >= sizes.first, full, lambda: more)
 
-        branches = [first, local, wide]
+        branches = [first, local, wide, lambda: known.piloted(params, new)]
         if (scan := self.scan) is not None:
             funs = jnp.where(new.valid, new.funs, jnp.inf)
             branches.append(lambda: known._scanned(params, scan.after(new.points, funs), sizes))
@@ -236,14 +251,10 @@ class ValueSearch(AbstractPointSearch):
 
     def _scanned(self, params: Params, scan: Scan, sizes: Sizes) -> "ValueSearch":
         """With this scan; the best places of all parameters together are where a search begins."""
-        one = jnp.ones_like(scan.fun)
-        anew = ValueSearch.of(params, scan.found, scan.nearest, one, self.history)
-        none = jnp.full_like(self.evaluated, -sizes.step)
-        kept = self.searches, self.rounds, self.noisy, scan, none
-        anew = eqx.tree_at(
-            lambda s: (s.searches, s.rounds, s.noisy, s.scan, s.evaluated), anew, kept
-        )
-        return _where(scan.done(), anew, eqx.tree_at(lambda s: s.scan, self, scan))
+        known = eqx.tree_at(lambda s: s.scan, self, scan)
+        anew = known._anew(params, scan.found, scan.nearest, jnp.ones_like(scan.fun))
+        anew = dataclasses.replace(anew, evaluated=jnp.full_like(self.evaluated, -sizes.step))
+        return where(scan.done(), anew, known)
 
     def _checks(self) -> Bool[Array, ""]:
         """Whether a point is evaluated again that was evaluated before."""
@@ -257,7 +268,7 @@ class ValueSearch(AbstractPointSearch):
         )
         # a metric can overflow where the function is flat
         finite = all_finite((center.theta, center.metric, center.trust.width))
-        center = _where(finite, center, self.center)
+        center = where(finite, center, self.center)
         none = jnp.zeros_like(self.taken)
         new = center, none, self.rounds + 1
         return eqx.tree_at(lambda s: (s.center, s.taken, s.rounds), self, new)
@@ -268,31 +279,21 @@ class ValueSearch(AbstractPointSearch):
         point, _, fun = self.history.best(self.start)
         lower, little = turn.lowered(fun)
         stuck = local & self.trust.stuck()
-        ended = turn.over() | stuck | (~local & _lost(self.center, sizes))
+        ended = turn.over() | stuck | (~local & self.center.lost(sizes))
         ended &= ~self._later()
 
         # what one has found the other begins with, unless it found little
         revive = ~local & lower & self.trust.stuck()
         revived = self.trust.revived(self.center.trust.width)
-        trust = _where(revive, revived, self.trust)
-        trust = _where(local, trust, trust.retried())
+        trust = where(revive, revived, self.trust)
+        trust = where(local, trust, trust.retried())
         move = local & ((lower & ~little) | (self.rounds == 0))
-        center = _where(move, self.center.moved(point), self.center)
-        done = trust.failed(), _lost(center, sizes)
-        ours, theirs = _where(local, *done), _where(local, *done[::-1])
+        center = where(move, self.center.moved(point), self.center)
+        done = trust.failed(), center.lost(sizes)
+        ours, theirs = where(local, *done), where(local, *done[::-1])
         after, other = turn.next(fun, len(self.start), (ours, theirs), stuck)
         stage = jnp.where(local == other, WIDE, TRUST).astype(self.stage.dtype)
         turned = eqx.tree_at(
             lambda s: (s.stage, s.trust, s.center, s.turn), self, (stage, trust, center, after)
         )
-        return _where(ended, turned, self)
-
-
-def _where(condition: Bool[Array, ""], a: Any, b: Any) -> Any:
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), a, b)
-
-
-def _lost(center: Center, sizes: Sizes) -> Bool[Array, ""]:
-    """Whether rounds of wide samples led nowhere for too long, or have no width any more."""
-    trust = center.trust
-    return (trust.stall * sizes.first >= sizes.patience) | nothing(trust.width)
+        return where(ended, turned, self)

@@ -37,6 +37,8 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     With fewer than 100 parameters the function is evaluated point by point. The first points are
     the start, and one sigma from it along each parameter. Where the loss there is more than ten
     times as high, a nearer point follows, and all widths of that parameter are as much smaller.
+    Where all residuals are the same, pairs of points follow, each four times as far away, up to a
+    thousand sigma, and then the first points again, as far as these found a change.
     From then on a step needs one evaluation: J is the fit to the nearest points that differs least
     from the last J, $y_t$ is the best point, and the radius $\Delta$ grows where the residuals come
     as predicted and shrinks where the loss does not fall. Where steps fail in a row, a shorter step

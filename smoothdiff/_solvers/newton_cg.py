@@ -31,8 +31,10 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     $$ \min_p \; g \cdot p + \tfrac12 p \cdot H p, \qquad \|p\|_{M^{-1}} \le \Delta $$
 
     With fewer than 100 parameters the function is evaluated point by point. The first points are
-    the start, and one sigma from it to both sides along each parameter. Then two models take turns,
-    and the one that lowers the function faster goes on:
+    the start, and one sigma from it to both sides along each parameter. Where all are the same,
+    pairs of points follow, each four times as far away, up to a thousand sigma, and then the first
+    points again, as far as these found a change. Then two models take turns, and the one that
+    lowers the function faster goes on:
 
     - a local one, around the best point. It interpolates the nearest evaluations, and its Hessian
       differs least from the last one. The step that minimises it within the trust region is one
