@@ -129,7 +129,7 @@ class PointStep(eqx.Module):
             finite = jnp.all(good) | later
         else:
             finite = after.enough(max(sizes.first, _ENOUGH))
-        finite = (finite | search.is_bold()) & jnp.all(jnp.isfinite(theta))
+        finite = (finite | search.is_trial()) & jnp.all(jnp.isfinite(theta))
         new_y, after = unless_failed(finite, (new_y, after), (self.y, search))
         unknown = jnp.asarray(jnp.nan, theta.dtype)
         seen = Seen(params.layout.tree(point), fun)

@@ -184,7 +184,7 @@ class AbstractPointSearch(eqx.Module):
         """Whether a step within the trust region comes next."""
         return self.stage == TRUST
 
-    def is_bold(self) -> Bool[Array, ""]:
+    def is_trial(self) -> Bool[Array, ""]:
         """Whether the next points may be anything, since nobody asked for them."""
         return self.is_local() | (self.stage == PILOT)
 
