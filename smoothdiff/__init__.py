@@ -18,6 +18,7 @@ from smoothdiff._newton_step import newton_step
 from smoothdiff._noise import Noise
 from smoothdiff._quadratic import HessianOperator, QuadraticModel
 from smoothdiff._ranges import Integer, Range
+from smoothdiff._recommend import Recommendation, recommend
 from smoothdiff._result import MinimiseError, Record, Result
 from smoothdiff._samplers import AbstractSampler, Gaussian, Orthogonal, Sobol, Uniform
 from smoothdiff._search import Search
@@ -62,6 +63,7 @@ __all__ = [
     "QuadraticModel",
     "Range",
     "Real",
+    "Recommendation",
     "Record",
     "Result",
     "Search",
@@ -85,6 +87,7 @@ __all__ = [
     "newton_step",
     "plot",
     "probe_support",
+    "recommend",
     "scale_by_filtered_adam",
     "smooth",
     "smooth_grad",

@@ -64,7 +64,10 @@ class HostProblem(Problem):
         return self.host.parts(y, state).judge(values, _loop)
 
     def _evaluator(self, y: PyTree) -> Evaluator:
-        return evaluator(self.fun, self.solver, self.args, y)
+        solver = self.solver
+        return evaluator(
+            self.fun, solver.squares, self.args, y, getattr(solver, "batch_size", None)
+        )
 
 
 class HostSteps(eqx.Module):
@@ -141,10 +144,11 @@ class _Function(eqx.Module):
         return jax.tree.map(jnp.asarray, self.fun(y, args)), None
 
 
-def evaluator(fun: Callable, solver: Any, args: PyTree, y: PyTree[Array]) -> Evaluator:
-    """The function for a solver and parameters like `y`."""
-    size = getattr(solver, "batch_size", None)
-    return Evaluator(_Function(fun), args, layout_of(y), solver.squares, size)
+def evaluator(
+    fun: Callable, squares: bool, args: PyTree, y: PyTree[Array], size: int | None = None
+) -> Evaluator:
+    """The function, which returns residuals or not, for parameters like `y`."""
+    return Evaluator(_Function(fun), args, layout_of(y), squares, size)
 
 
 def rows_at(evaluate: Evaluator, points: Float[Array, "m n"], at_once: int) -> Float[Array, "m P"]:

@@ -72,7 +72,7 @@ def with_covariance(
     unit_fun = units.wrap(fun) if any(units.spaces) else fun
     solver, y = result.solver, answer.y
     with reraise():
-        evaluate = evaluator(unit_fun, solver, args, y)
+        evaluate = evaluator(unit_fun, True, args, y, solver.batch_size)
         rows = rows_at(evaluate, jnp.asarray(points), solver.sizes(y).step)
         rows = jax.block_until_ready(rows)
     if rows.shape[1] != size:

@@ -1,0 +1,252 @@
+"""`recommend`: in words, what to choose for a function, and what it looks like around a start."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from smoothdiff._black_box import UnknownOutputError, reraise
+from smoothdiff._call_checks import check_call, check_number, check_residuals, explained
+from smoothdiff._default_solver import default_solver
+from smoothdiff._host_steps import evaluator, rows_at
+from smoothdiff._limits import Limits
+from smoothdiff._look_around import WIDEST, View, look_around
+from smoothdiff._params import as_key, take_apart
+from smoothdiff._run import inexact
+from smoothdiff._unit_space import UnitSpace
+
+# with so many parameters or more, so many random directions instead of each parameter
+_MANY, _DIRECTIONS = 100, 8
+# effects that differ by more are of other scales; changes of less than so many times the noise are
+# not seen
+_SCALES, _SEEN = 1e3, 3.0
+_LISTED = 6
+
+
+@dataclasses.dataclass(frozen=True)
+class Recommendation:
+    """What `recommend` says; `print` it.
+
+    Attributes:
+        solver: to pass to the function `run`.
+        sigma: its smoothing width, in unit coordinates where there is a space.
+        run: "least_squares" or "minimise".
+        max_evaluations: after which the run ends without any other limit; usually it does before.
+        seen: what the samples showed.
+        advice: what to try.
+        evaluations: of the function, for this.
+    """
+
+    solver: Any = dataclasses.field(repr=False)
+    sigma: PyTree
+    run: str
+    max_evaluations: int
+    seen: tuple[str, ...]
+    advice: tuple[str, ...]
+    evaluations: int
+
+    def __str__(self) -> str:
+        leaves, _ = jax.tree_util.tree_flatten_with_path(self.sigma)
+        widths = [
+            f"{jax.tree_util.keystr(path, simple=True, separator='.')} {_number(leaf)}".strip()
+            for path, leaf in leaves
+        ]
+        lines = [
+            f"sd.{self.run} with {type(self.solver).__name__}, sigma {', '.join(widths)}, at most "
+            f"{self.max_evaluations} evaluations",
+            f"Seen at {self.evaluations} evaluations around y0:",
+            *(f"- {line}" for line in self.seen),
+            "To try:",
+            *(f"- {line}" for line in self.advice),
+        ]
+        return "\n".join(lines)
+
+
+def recommend(
+    fun: Callable[[PyTree, PyTree], Any],
+    y0: PyTree,
+    args: PyTree = None,
+    *,
+    key: Any,
+    sigma: PyTree = None,
+    space: PyTree = None,
+    bounds: tuple[PyTree, PyTree] | None = None,
+) -> Recommendation:
+    """Says what to choose for a function, what it looks like around y0, and what to try.
+
+    The solver and sigma are those that `minimise` or `least_squares` would choose, but for what was
+    seen: where nothing changes within sigma it is wider, and where values are not finite the solver
+    leaves them out. Whether residuals or one number are returned decides between the two.
+
+    It evaluates y0 twice, and one sigma to both sides along each parameter; with 100 parameters and
+    more along 8 random directions. Where nothing changes, up to 6 evaluations follow up to 64 sigma
+    away, and where something does, 6 between there and y0, which tell jumps from slopes. In all it
+    takes at most 2 n + 14 evaluations, where n is 8 for many parameters; 2 n + 4 if there is noise.
+
+    Args:
+        fun: the function, `fun(y, args)`: one number, or residuals. May contain a black box.
+        y0: where to start, a pytree of numbers and arrays.
+        args: passed on to `fun`.
+        key: a random key.
+        sigma: as for `minimise`.
+        space: as for `minimise`.
+        bounds: as for `minimise`.
+
+    Returns:
+        A `Recommendation`.
+
+    Raises:
+        TypeError, ValueError: an argument that cannot work, as for `minimise`.
+        BlackBoxError: an evaluation failed.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, smoothdiff as sd
+        >>> pixels = jnp.arange(32.0)
+        >>> bar = lambda y, photo: jnp.where(jnp.abs(pixels - y) < 4.5, 1.0, 0.0) - photo
+        >>> advice = sd.recommend(bar, 15.0, jnp.zeros(32), key=jax.random.key(0))
+        >>> advice.run, float(advice.sigma), advice.evaluations
+        ('least_squares', 3.0, 10)
+        >>> advice.seen[-1]
+        'the function jumps, or has ripples: its changes do not vanish over short distances'
+
+    Source: own.
+    """
+    check_call(fun, y0, bounds, space)
+    units = UnitSpace.of(y0, space)
+    if space is not None:
+        fun, y0, bounds = units.wrap(fun), units.unit(y0), units.bounds()
+        sigma = units.sigma() if sigma is None else sigma
+    y = jax.tree.map(inexact, y0)
+    squares, spent = _residuals(fun, y, args)
+    solver = default_solver(y, bounds, sigma, squares)
+    params = take_apart(y, solver.sigma, bounds)
+    n = params.theta.size
+    one, other = jax.random.split(as_key(key))
+    each = n < _MANY
+    shape = _DIRECTIONS, n
+    directions = np.eye(n) if each else np.asarray(jax.random.rademacher(one, shape)) / n**0.5
+    further = np.asarray(jax.random.normal(other, (n,)))
+    evaluate = evaluator(fun, squares, args, y)
+
+    def rows(points: np.ndarray) -> np.ndarray:
+        with reraise():
+            return np.asarray(rows_at(evaluate, jnp.asarray(points), 1))
+
+    dtype = params.theta.dtype
+    view = look_around(
+        rows,
+        np.asarray(params.theta),
+        np.asarray(params.sigma),
+        lambda points: np.asarray(jax.vmap(params.clip)(jnp.asarray(points, dtype))),
+        directions,
+        further / np.linalg.norm(further),
+    )
+    if view.width > 1:
+        wider = jax.tree.map(lambda s: s * view.width, solver.sigma)
+        solver = default_solver(y, bounds, wider, squares)
+    if not view.finite or np.any(view.failed):
+        solver = eqx.tree_at(lambda s: s.nonfinite, solver, "drop")
+    names = units.labels() if each else [f"direction {i}" for i in range(_DIRECTIONS)]
+    seen, advice = _words(view, names, squares, n)
+    limits = Limits.of(solver, y, None, None, None, None)
+    steps = limits.expected or 0
+    return Recommendation(
+        solver=solver,
+        sigma=solver.sigma,
+        run="least_squares" if squares else "minimise",
+        max_evaluations=steps * solver.evaluations_per_step(y) + solver.final_evaluations(y),
+        seen=tuple(seen),
+        advice=tuple(advice),
+        evaluations=view.evaluations + spent,
+    )
+
+
+def _residuals(fun: Callable, y: PyTree, args: PyTree) -> tuple[bool, int]:
+    """Whether the function returns residuals, and how many evaluations it took to know."""
+    spent, shapes = 0, lambda: jax.eval_shape(lambda y: jax.tree.map(jnp.asarray, fun(y, args)), y)
+    with explained():
+        try:
+            out = shapes()
+        except UnknownOutputError:
+            # only an evaluation tells what a black box returns
+            fun(y, args)
+            out, spent = shapes(), 1
+    squares = [leaf.shape for leaf in jax.tree.leaves(out)] != [()]
+    (check_residuals if squares else check_number)(out)
+    return squares, spent
+
+
+def _words(view: View, names: list[str], squares: bool, n: int) -> tuple[list[str], list[str]]:
+    """What was seen, and what to try."""
+    seen, advice, effects = [], [], view.effects
+    if not view.finite:
+        return ["the function is not finite at y0"], ["another y0: no search can begin here"]
+    known = effects > _SEEN * view.noise
+    if view.noise:
+        beside = f"beside changes of {np.max(effects):.2g} within sigma"
+        seen.append(f"noise: the same point twice differs by {view.noise:.2g}, {beside}")
+        if not np.any(known):
+            advice.append("a larger sigma: within this one there is nothing but noise")
+        else:
+            advice.append("a target or max_evaluations, as noise ends a run late")
+    else:
+        seen.append("no noise: the same point twice gives the same")
+    if view.width == 1 and n < _MANY:
+        order = np.argsort(-effects, kind="stable")
+        amounts = [f"{names[j]} {effects[j]:.2g}" for j in order[:_LISTED]]
+        more = ", ..." if len(order) > _LISTED else ""
+        seen.append(f"changes within sigma: {', '.join(amounts)}{more}")
+    if view.width > 1:
+        seen.append(f"a plateau: nothing changes within sigma, but {view.width:g} times as far")
+        advice.append(f"this solver, whose sigma is {view.width:g} times the usual one")
+    elif not view.width:
+        seen.append(f"a plateau: nothing changes within {WIDEST:g} sigma")
+        advice.append("another y0, a far larger sigma, or a look at whether fun uses y at all")
+    elif not np.all(known | view.failed):
+        idle = _listed(names, ~known & ~view.failed)
+        amount = "no more than noise does" if view.noise else "nothing, or less than rounding"
+        seen.append(f"{idle} changes {amount}")
+        advice.append(f"a larger sigma for {idle}; what never matters is better off in args")
+    if np.any(view.failed):
+        seen.append(f"values that are not finite along {_listed(names, view.failed)}")
+        advice.append('bounds, or nonfinite="drop", which this solver has')
+    strong, weak = np.argmax(effects), np.argmin(np.where(known, effects, np.inf))
+    if effects[strong] > _SCALES * effects[weak] > 0:
+        ratio = effects[strong] / effects[weak]
+        seen.append(
+            f"scales that differ: {names[strong]} changes the function {ratio:.0e} times as much "
+            f"as {names[weak]}"
+        )
+        advice.append(
+            f"a smaller sigma for {names[strong]} or a larger one for {names[weak]}, if these are "
+            "not in the same units: sigma like y0, or a space"
+        )
+    if view.jumps:
+        seen.append(
+            "the function jumps, or has ripples: its changes do not vanish over short distances"
+        )
+        advice.append("no smaller sigma than the jumps are apart")
+    elif view.jumps is not None:
+        seen.append("smooth where it was looked at")
+    if not squares:
+        advice.append("sd.least_squares on the residuals, if it is a sum of squares: far cheaper")
+    if n >= _MANY and squares:
+        advice.append("support, if each parameter moves few residuals")
+    return seen, advice or ["the call as it is"]
+
+
+def _listed(names: list[str], chosen: np.ndarray) -> str:
+    found = [name for name, take in zip(names, chosen, strict=True) if take]
+    return ", ".join(found[:_LISTED]) + (", ..." if len(found) > _LISTED else "")
+
+
+def _number(leaf: Any) -> str:
+    values = np.asarray(leaf)
+    if values.size and np.all(values == values.flat[0]):
+        return f"{values.flat[0]:.3g}"
+    return np.array2string(values, precision=3, threshold=_LISTED, separator=", ")
