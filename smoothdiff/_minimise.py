@@ -175,7 +175,8 @@ def least_squares(
         checkpoint: as for `minimise`.
 
     Returns:
-        A `Result`, whose `fun` is half the sum of squares.
+        A `Result`, whose `fun` is half the sum of squares. With `GaussNewton` and fewer than 100
+        parameters it has their `covariance`, `parameter_errors` and `parameter_intervals`.
 
     Raises:
         MinimiseError: a black box failed, or an estimate was NaN or infinite. Nothing is lost: its
