@@ -34,6 +34,8 @@ from smoothdiff._solvers._wide_rounds import Wide, further, sides_of
 # evaluations of wide rounds since the last lower point, for each parameter, until the local model
 # goes on: around a lower point that they found with a radius of so many widths, else as it was
 _IDLE, _NARROWER = 6, 0.1
+# rounds that came to nothing are so much narrower when they are tried again
+_VAIN = 0.5
 # so many steps in a row that halve the loss, within the width, are trusted again
 _TRUE = 2
 
@@ -210,7 +212,9 @@ class ResidualSearch(AbstractPointSearch):
     ) -> "ResidualSearch":
         trust = self.trust.revise(proposal, row, rows, good)
         local = eqx.tree_at(lambda s: s.trust, self, trust)
-        scale = jnp.maximum(self.wide.scale, 1)
+        wide = self.wide
+        vain = (wide.rounds > 0) & (wide.true < _TRUE)
+        scale = jnp.where(vain, _VAIN * wide.scale, jnp.maximum(wide.scale, 1))
         return where(trust.failed(), local._to_wide(scale), local)
 
     def _after_wide(
