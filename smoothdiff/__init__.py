@@ -9,13 +9,14 @@ from smoothdiff._check_gradient import GradientCheck, check_gradient
 from smoothdiff._control_variate import control_variate
 from smoothdiff._filtered_adam import filter_updates, filtered_adam, scale_by_filtered_adam
 from smoothdiff._gp import GaussianProcess
-from smoothdiff._host_calls import BlackBoxError
+from smoothdiff._host_samples import BlackBoxError
 from smoothdiff._importance import Importance, difference_hvp
 from smoothdiff._large_steps import large_steps
 from smoothdiff._least_squares import LeastSquares
 from smoothdiff._minimise import least_squares, minimise
 from smoothdiff._newton_step import newton_step
 from smoothdiff._noise import Noise
+from smoothdiff._processes import Processes
 from smoothdiff._quadratic import HessianOperator, QuadraticModel
 from smoothdiff._ranges import Integer, Range
 from smoothdiff._recommend import Recommendation, recommend
@@ -60,6 +61,7 @@ __all__ = [
     "Orthogonal",
     "Periodic",
     "Positive",
+    "Processes",
     "QuadraticModel",
     "Range",
     "Real",

@@ -1,10 +1,8 @@
 """`black_box`: a host function of NumPy arrays as a JAX function, with faults that can be read."""
 
-import concurrent.futures
-import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -12,9 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from smoothdiff._host_calls import BlackBoxError, HostFunction, Samples, wait_for
+from smoothdiff._executors import InTurn, engine
+from smoothdiff._host_calls import HostFunction
+from smoothdiff._host_samples import BlackBoxError, Samples, wait_for
 from smoothdiff._outputs import Outputs
 from smoothdiff._params import is_concrete
+from smoothdiff._reraise import reraise, was_raised
 
 
 class UnknownOutputError(TypeError):
@@ -26,7 +27,7 @@ def black_box(
     out: PyTree = None,
     *,
     batched: bool = False,
-    executor: concurrent.futures.Executor | None = None,
+    executor: Any = None,
     on_error: str = "raise",
     on_nonfinite: str = "raise",
     retries: int = 0,
@@ -54,17 +55,20 @@ def black_box(
         batched: Whether `fun` takes a whole batch. Every leaf of its arguments then has one leading
             axis, of the same size everywhere, and its results must have it too. The size is 1
             outside `jax.vmap`; nested `jax.vmap` become one axis. If False, each sample is a call.
-        executor: Where single calls run, several at once; the order of the results is kept. Any
-            `concurrent.futures.Executor`. Processes must be spawned, as a fork of JAX can hang.
-        on_error: "raise", or "nan" so that a sample for which `fun` raises an exception or runs out
-            of time is NaN in every output (the whole batch if `batched`). `nonfinite="drop"` in the
-            transforms then leaves it out. A wrong structure, shape or dtype always raises, and so
-            does a call that is to find `out`.
+        executor: Where single calls run, several at once, each result taken when it comes: a
+            `concurrent.futures.Executor`, such as a `ThreadPoolExecutor`; or
+            `smoothdiff.Processes`, for functions that crash or hang. Processes must be spawned, as
+            a fork of JAX can hang.
+        on_error: "raise", or "nan" so that a sample for which `fun` raises an exception, calls
+            `sys.exit`, loses its worker or runs out of time is NaN in every output (the whole batch
+            if `batched`). `nonfinite="drop"` in the transforms then leaves it out. A wrong
+            structure, shape or dtype always raises, and so does a call that is to find `out`.
         on_nonfinite: "raise", or "nan" so that a sample with a NaN or an infinity in any of its
             outputs is NaN in every output.
         retries: How many times a call that failed is tried again. Takes no part in `on_nonfinite`.
-        timeout: Seconds that a call may take. Needs an `executor`. A call that cannot be cancelled
-            goes on in its worker, and keeps it busy.
+        timeout: Seconds that a call may take. Needs an `executor`. `Processes` kill a worker that
+            takes longer, and begin another one. A thread goes on, and is lost to its
+            pool, as is a process of another pool; once all are lost, an error says so.
 
     Returns:
         A JAX function with the name and docstring of `fun`.
@@ -95,6 +99,14 @@ def black_box(
         >>> x = clipped(jnp.array([-1.0, 0.5]))
         >>> jax.jit(clipped)(x)
         Array([0. , 0.5], dtype=float32)
+
+        On four processes, with what hangs for a minute tried once more and then left out:
+
+        >>> with sd.Processes(4) as workers:  # doctest: +SKIP
+        ...     f = sd.black_box(
+        ...         simulate, 0.0, executor=workers, timeout=60, retries=1, on_error="nan",
+        ...     )
+        ...     result = sd.minimise(lambda y, args: f(y), y0, key=key)
     """
     if fun is None:
         return functools.partial(
@@ -112,7 +124,8 @@ def black_box(
             f"black_box needs a function of NumPy arrays, not {fun!r}; what it returns is out=..."
         )
     name = getattr(fun, "__name__", type(fun).__name__)
-    host = HostFunction(fun, name, batched, executor, on_error, on_nonfinite, retries, timeout)
+    nan = on_error, on_nonfinite
+    host = HostFunction(fun, name, batched, engine(executor), *nan, retries, timeout)
     _check(host)
     promised = None if out is None else _jax_function(host, Outputs.like(out))
     found = _Found()
@@ -186,7 +199,7 @@ def _first(host: HostFunction, leaves: list[jax.Array], tree: Any) -> tuple[PyTr
             f"returned, {value!r}: {error}"
         ) from error
     rows = [np.empty((1, *out.shape), out.dtype) for out in outputs.shapes()]
-    host.store(samples, None if host.batched else 0, value, rows, outputs.tree)
+    host.accept(samples, None if host.batched else 0, value, rows, outputs.tree)
     return outputs.tree.unflatten([jnp.asarray(row[0]) for row in rows]), outputs
 
 
@@ -198,34 +211,6 @@ def _unknown(name: str, args: tuple) -> str:
         f"it once before, with arrays of these shapes, or write sd.black_box({name}, "
         "out=jax.ShapeDtypeStruct((), jnp.float32)) with the shape and dtype of what it returns"
     )
-
-
-# What has been raised in a callback since each of the `reraise` blocks now open was entered.
-_open_blocks: dict[int, list[BaseException]] = {}
-
-
-@contextlib.contextmanager
-def reraise() -> Iterator[None]:
-    """Inside, what a black box raises arrives as itself: BlackBoxError with its cause, Ctrl-C.
-
-    Of every exception in a callback, even KeyboardInterrupt, JAX keeps only the text: it raises a
-    JaxRuntimeError or, from the second call of a jitted function on, a ValueError. By that text the
-    original is found again. It has to be put aside where this block and the callback, which may run
-    in a thread of JAX's, both see it, hence in the module; but only while a block is open. Results
-    must be awaited inside (`jax.block_until_ready`).
-    """
-    raised: list[BaseException] = []
-    _open_blocks[id(raised)] = raised
-    try:
-        yield
-    except (jax.errors.JaxRuntimeError, ValueError) as failure:
-        text = str(failure)
-        for error in reversed(raised):
-            if type(error).__name__ in text and str(error) in text:
-                raise error.with_traceback(None) from error.__cause__
-        raise
-    finally:
-        del _open_blocks[id(raised)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -246,8 +231,7 @@ class _Callback:
             self.host(samples, outs, self.out_tree)
             return [out.reshape(samples.batch_shape + out.shape[1:]) for out in outs]
         except BaseException as error:
-            for raised in list(_open_blocks.values()):
-                raised.append(error)
+            was_raised(error)
             raise
 
 
@@ -265,20 +249,15 @@ def _check(host: HostFunction) -> None:
         value = getattr(host, option)
         if value not in ("raise", "nan"):
             raise ValueError(f'{option} must be "raise" or "nan", not {value!r}')
-    if host.executor is not None and not isinstance(host.executor, concurrent.futures.Executor):
-        raise TypeError(
-            "executor must be a concurrent.futures.Executor, such as ThreadPoolExecutor(4) or "
-            f"client.get_executor() of a dask client, not {host.executor!r}"
-        )
-    if host.executor is not None and host.batched:
+    pool = not isinstance(host.engine, InTurn)
+    if pool and host.batched:
         raise ValueError(
             "batched=True makes one call of a whole batch, which an executor cannot share out: "
             "leave out the executor, or write batched=False"
         )
-    if host.timeout is not None and host.executor is None:
+    if host.timeout is not None and not pool:
         raise ValueError(
-            "timeout needs an executor that runs the calls, "
-            "for example executor=concurrent.futures.ThreadPoolExecutor(1)"
+            "timeout needs an executor that runs the calls, for example executor=sd.Processes(1)"
         )
     if host.timeout is not None and not host.timeout > 0:
         raise ValueError(f"timeout must be a positive number of seconds, not {host.timeout!r}")

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from smoothdiff._digest import differing, listed, parts
+from smoothdiff._identity import Identity, can_change, listed
 
 
 class Checkpoint:
@@ -27,8 +27,7 @@ class Checkpoint:
         self.doubtful: set[str] = set()
         self._path = Path(path)
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        self._problem = problem
-        self._parts: dict[str, str | None] = {**parts(**problem)}
+        self._identity = Identity(**problem)
 
     def load(self, like: PyTree) -> PyTree | None:
         """What was saved, with the structure and dtypes of `like`; None if there is no file.
@@ -44,11 +43,11 @@ class Checkpoint:
                 arrays = [file[str(i)] for i in range(len(file.files) - 1)]
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise ValueError(f"{self._path} is not a checkpoint: name another file") from error
-        differ = differing(kept, self._parts)
-        self.doubtful = {name for name in differ if name.startswith("fun") and ":" in name}
+        differ = self._identity.differing(kept)
+        self.doubtful = {name for name in differ if name.startswith("fun") and can_change(name)}
         if differ > self.doubtful:
             raise self.other(f"its {listed(differ)} differed")
-        self._parts = kept
+        self._identity.parts = kept
         leaves, treedef = jax.tree.flatten(like)
         return treedef.unflatten(map(_restore, arrays, leaves))
 
@@ -61,9 +60,8 @@ class Checkpoint:
 
     def save(self, tree: PyTree) -> None:
         """Replaces the file; a crash in the middle of it leaves the old one."""
-        for name in differing(self._parts, parts(**self._problem)):
-            self._parts[name] = None
-        arrays: dict[str, Any] = {"problem": np.asarray(json.dumps(self._parts))}
+        self._identity.settle()
+        arrays: dict[str, Any] = {"problem": np.asarray(json.dumps(self._identity.parts))}
         arrays |= {str(i): _numpy(leaf) for i, leaf in enumerate(jax.tree.leaves(tree))}
         part = self._path.with_name(f"{self._path.name}.{os.getpid()}.part")
         try:

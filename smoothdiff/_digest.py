@@ -8,9 +8,9 @@ import re
 import sys
 import sysconfig
 import types
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -23,7 +23,17 @@ _PLAIN = type(None), bool, int, float, complex, str, bytes, type(...), type(NotI
 _Facts = Iterator[tuple[str, bytes]]
 
 
-def parts(**values: Any) -> dict[str, str]:
+class _Met(NamedTuple):
+    """The objects that were met, by which cycles end, and JAX's arrays with their digests.
+
+    Both by id; kept alive here, so that no other object gets the same one.
+    """
+
+    objects: dict[int, tuple[Any, str]]
+    arrays: dict[int, tuple[jax.Array, bytes]]
+
+
+def parts(values: dict[str, Any], arrays: dict | None = None) -> dict[str, str]:
     """Digests of the values and, under names with a dot, of what each is made of.
 
     Numbers, texts, arrays and containers count by value. A function counts by its code, constants
@@ -34,7 +44,9 @@ def parts(**values: Any) -> dict[str, str]:
     and what is said in comments does not count. Another version of Python has other code.
 
     Args:
-        **values: any Python values, by the names that their parts begin with.
+        values: any Python values, by the names that their parts begin with.
+        arrays: a dictionary for the next call with the same values, in which those arrays that
+            cannot change are not read again.
 
     Returns:
         For each name of a part its digest. The closure variable `scale` of a function that is given
@@ -44,74 +56,62 @@ def parts(**values: Any) -> dict[str, str]:
     """
     hashes: dict[str, Any] = {}
     for name, value in values.items():
-        for part, fact in _facts(name, value, {}):
+        for part, fact in _facts(name, value, _Met({}, {} if arrays is None else arrays)):
             digest = hashes.setdefault(part, hashlib.blake2b(digest_size=16))
             digest.update(len(fact).to_bytes(8, "little") + fact)
     return {part: digest.hexdigest() for part, digest in hashes.items()}
 
 
-def differing(kept: Mapping[str, str | None], now: Mapping[str, str | None]) -> set[str]:
-    """The names of the parts that are not as they were, but for those that are known to change.
-
-    Of these there is None in place of a digest.
-    """
-    ignored = {name for parts in (kept, now) for name, part in parts.items() if part is None}
-    return {name for name, _ in kept.items() ^ now.items()} - ignored
+def digest_of(array: np.ndarray) -> bytes:
+    """Says the shape, the dtype and every bit of an array."""
+    digest = hashlib.blake2b(f"{array.dtype} {array.shape} ".encode(), digest_size=16)
+    digest.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
+    return digest.digest()
 
 
-def listed(names: Iterable[str]) -> str:
-    """Names of parts as an error shows them."""
-    shown = sorted({".".join(filter(None, re.split(r"[.:]", name))) for name in names})
-    return ", ".join([*shown[:6], *([f"{len(shown) - 6} more"] if len(shown) > 6 else [])])
-
-
-def _facts(name: str, value: Any, seen: dict[int, tuple[Any, str]]) -> _Facts:
-    """What makes up a value, each fact with the name of the part that it belongs to.
-
-    `seen` has the objects that were met, by which cycles end. It also keeps them alive, so that no
-    other object gets the same id.
-    """
+def _facts(name: str, value: Any, met: _Met) -> _Facts:
+    """What makes up a value, each fact with the name of the part that it belongs to."""
     kind = type(value)
     if kind in _PLAIN:
         yield name, f"{kind.__name__} {value!r}".encode()
     elif isinstance(value, np.ndarray | np.generic | jax.Array):
-        yield from _array(name, value, seen)
+        yield from _array(name, value, met)
     elif kind is tuple:
         yield name, f"tuple {len(value)}".encode()
         for item in value:
-            yield from _facts(name, item, seen)
+            yield from _facts(name, item, met)
     elif kind in (set, frozenset):
         # in an order of their own, as that of a set differs between processes
         part = name if kind is frozenset else _inside(name)
         yield part, " ".join([kind.__name__, *sorted(map(_whole, value))]).encode()
     elif kind is types.CodeType:
-        yield from _code(name, value, seen)
+        yield from _code(name, value, met)
     elif isinstance(value, types.ModuleType | jax.tree_util.PyTreeDef):
         text = value.__name__ if isinstance(value, types.ModuleType) else _without_addresses(value)
         yield name, text.encode()
-    elif id(value) in seen:
-        yield name, f"see {seen[id(value)][1]}".encode()
+    elif id(value) in met.objects:
+        yield name, f"see {met.objects[id(value)][1]}".encode()
     else:
-        seen[id(value)] = value, name
-        yield from _object(name, value, seen)
+        met.objects[id(value)] = value, name
+        yield from _object(name, value, met)
 
 
-def _object(name: str, value: Any, seen: dict) -> _Facts:
+def _object(name: str, value: Any, met: _Met) -> _Facts:
     """The facts of what can be part of itself."""
     kind: Any = type(value)
-    inside = lambda items: _named(name, items, seen)
+    inside = lambda items: _named(name, items, met)
     if kind is list or kind is dict:
         yield name, kind.__name__.encode()
         items = tuple(value.items() if kind is dict else value)
-        yield from _facts(_inside(name), items, seen)
+        yield from _facts(_inside(name), items, met)
     elif kind is types.FunctionType:
-        yield from _function(name, value, seen)
+        yield from _function(name, value, met)
     elif kind is types.MethodType:
         yield from inside({"": value.__func__, "self": value.__self__})
     elif isinstance(value, type):
         yield name, f"class {value.__module__}.{value.__qualname__}".encode()
         if _edited(value.__module__):
-            yield from _facts(name, value.__bases__, seen)
+            yield from _facts(name, value.__bases__, met)
             yield from inside(_written(value))
     elif isinstance(value, functools.partial):
         yield from inside({"": value.func, **dict(enumerate(value.args)), **value.keywords})
@@ -122,26 +122,26 @@ def _object(name: str, value: Any, seen: dict) -> _Facts:
         # a field of a module of equinox may be missing
         its = {"": kind, **{field: getattr(value, field, None) for field in fields}}
         frozen = kind.__dataclass_params__.frozen or isinstance(value, eqx.Module)
-        yield from _named(name if frozen else _inside(name), its, seen)
+        yield from _named(name if frozen else _inside(name), its, met)
     elif (wrapped := getattr(value, "__wrapped__", None)) and not _edited(kind.__module__):
         yield from inside({"": wrapped})  # jax.jit and the like
     else:
-        yield from _facts(name, kind, seen)
+        yield from _facts(name, kind, met)
         kept = _pickled(value)
         if isinstance(kept, str):
             yield name, kept.encode()
         else:
-            yield from _named(_inside(name), kept, seen)
+            yield from _named(_inside(name), kept, met)
 
 
-def _named(name: str, items: dict[Any, Any], seen: dict) -> _Facts:
+def _named(name: str, items: dict[Any, Any], met: _Met) -> _Facts:
     """Facts of the items as parts of their own; of the one without a name, of the whole."""
     dot = "" if name.endswith(":") else "."
     for key, item in items.items():
         own = key != "" and name.count(".") < _DOTS
         if not own:
             yield name, f"{key}".encode()
-        yield from _facts(f"{name}{dot}{key}" if own else name, item, seen)
+        yield from _facts(f"{name}{dot}{key}" if own else name, item, met)
 
 
 def _inside(name: str) -> str:
@@ -149,34 +149,39 @@ def _inside(name: str) -> str:
     return name if ":" in name else f"{name}:"
 
 
-def _array(name: str, value: Any, seen: dict) -> _Facts:
-    if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
-        yield name, f"{jax.random.key_impl(value)}".encode()
-        value = jax.random.key_data(value)
-    array = np.asarray(value)
-    yield name, f"array {array.dtype} {array.shape}".encode()
-    if array.dtype == object:
-        yield from _facts(name, array.tolist(), seen)
+def _array(name: str, value: Any, met: _Met) -> _Facts:
+    if isinstance(value, jax.Array):
+        if id(value) not in met.arrays:
+            met.arrays[id(value)] = value, _digest_of_jax(value)
+        yield name, met.arrays[id(value)][1]
+    elif value.dtype == object:
+        yield from _facts(name, value.tolist(), met)
     else:
-        flat = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
-        yield name, hashlib.blake2b(flat.data, digest_size=16).digest()
+        yield name, digest_of(np.asarray(value))
 
 
-def _code(name: str, code: types.CodeType, seen: dict) -> _Facts:
+def _digest_of_jax(array: jax.Array) -> bytes:
+    if jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
+        impl = str(jax.random.key_impl(array)).encode()
+        return impl + digest_of(np.asarray(jax.random.key_data(array)))
+    return digest_of(np.asarray(array))
+
+
+def _code(name: str, code: types.CodeType, met: _Met) -> _Facts:
     # neither its name nor the places in the file
     counts = code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount, code.co_flags
     names = code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars
     rest = code.co_code, code.co_exceptiontable, code.co_consts
-    yield from _facts(name, (counts, names, rest), seen)
+    yield from _facts(name, (counts, names, rest), met)
 
 
-def _function(name: str, fun: types.FunctionType, seen: dict) -> _Facts:
+def _function(name: str, fun: types.FunctionType, met: _Met) -> _Facts:
     defaults = fun.__defaults__, tuple((fun.__kwdefaults__ or {}).items())
-    yield from _facts(name, (fun.__code__, *defaults), seen)
+    yield from _facts(name, (fun.__code__, *defaults), met)
     cells = zip(fun.__code__.co_freevars, fun.__closure__ or (), strict=True)
-    yield from _named(name, {variable: _content(cell) for variable, cell in cells}, seen)
+    yield from _named(name, {variable: _content(cell) for variable, cell in cells}, met)
     if _edited(fun.__globals__.get("__name__")):  # __module__ can be that of a function it wraps
-        yield from _named(name, _used(fun), seen)
+        yield from _named(name, _used(fun), met)
 
 
 def _content(cell: types.CellType) -> Any:
@@ -243,7 +248,7 @@ def _pickled(value: Any) -> dict[str, Any] | str:
 
 
 def _whole(value: Any) -> str:
-    return " ".join(f"{part} {digest}" for part, digest in parts(_=value).items())
+    return " ".join(f"{part} {digest}" for part, digest in parts({"": value}).items())
 
 
 def _without_addresses(value: Any) -> str:

@@ -19,7 +19,7 @@ from smoothdiff._call_checks import (
     explained,
 )
 from smoothdiff._default_solver import default_solver
-from smoothdiff._host_calls import BlackBoxError
+from smoothdiff._host_samples import BlackBoxError
 from smoothdiff._host_steps import HostProblem
 from smoothdiff._limits import Limits
 from smoothdiff._result import MinimiseError, Record, Result

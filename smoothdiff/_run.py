@@ -16,11 +16,11 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, PyTree
 
-from smoothdiff._black_box import reraise
 from smoothdiff._checkpoint import Checkpoint
-from smoothdiff._digest import listed
+from smoothdiff._identity import listed
 from smoothdiff._limits import Limits
 from smoothdiff._parameter_errors import Answer
+from smoothdiff._reraise import reraise
 from smoothdiff._result import MinimiseError, Record, Result
 from smoothdiff._solvers import Progress
 from smoothdiff._solvers._wrapped import Wrapped

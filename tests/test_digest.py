@@ -35,7 +35,7 @@ def scaled(scale, power=2):
 
 def differing(one, other):
     """The names of the parts in which two values differ."""
-    one, other = parts(fun=one), parts(fun=other)
+    one, other = parts({"fun": one}), parts({"fun": other})
     return sorted(name for name in {**one, **other} if one.get(name) != other.get(name))
 
 
@@ -184,7 +184,7 @@ def test_globals_of_modules_that_can_be_edited_count():
     assert differing(f, compiled(source.format(2), A=1.0, B=7)) == []
     assert differing(f, compiled(source.format(2), A=2.0)) == ["fun.A"]
     assert differing(f, compiled(source.format(3), A=1.0)) == ["fun.g"]
-    assert "fun.helper.SCALE" in parts(fun=through_helper)
+    assert "fun.helper.SCALE" in parts({"fun": through_helper})
 
 
 def test_functions_of_modules_of_the_users_count(tmp_path, monkeypatch):
@@ -195,7 +195,7 @@ def test_functions_of_modules_of_the_users_count(tmp_path, monkeypatch):
         tools = __import__(f"tools{i}")
         seen.append(compiled("def f(y):\n    return tools.helper(y) + np.sin(y)", tools=tools))
     assert "fun.tools.helper" in differing(*seen)
-    assert not any("np." in part for part in parts(fun=seen[0]))
+    assert not any("np." in part for part in parts({"fun": seen[0]}))
 
 
 def test_methods_that_a_method_calls_count():
@@ -237,7 +237,7 @@ def test_cycles_end():
     loop.append(loop)
     renderer: Any = Renderer(1, np.ones(2))
     renderer.me = renderer
-    assert all(parts(a=even, b=loop, c=renderer).values())
+    assert all(parts({"a": even, "b": loop, "c": renderer}).values())
     assert differing(even, odd) != []
 
 
@@ -248,7 +248,7 @@ def test_another_process_gives_the_same_digests():
     """With other seeds of its hashes, of which sets and addresses depend."""
     script = (
         "import test_digest as t; from smoothdiff._digest import parts\n"
-        "for name, (one, *_) in t.PAIRS.items(): print(name, sorted(parts(_=one()).items()))"
+        "for n, (one, *_) in t.PAIRS.items(): print(n, sorted(parts(dict(fun=one())).items()))"
     )
     folders = os.pathsep.join([os.path.dirname(__file__), *sys.path])
     start = lambda seed: subprocess.Popen(

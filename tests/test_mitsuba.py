@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.scenes import shadow
-from smoothdiff._host_calls import BlackBoxError
+from smoothdiff._host_samples import BlackBoxError
 from smoothdiff.renderers import mitsuba
 
 mi.set_variant("scalar_rgb")

@@ -1,0 +1,246 @@
+"""How calls of a host function are made: one after another, or several at once by an executor.
+
+Runs inside JAX's callbacks, so no JAX here.
+"""
+
+import concurrent.futures
+import dataclasses
+import functools
+import itertools
+import queue
+import time
+from collections import deque
+from collections.abc import Callable, Generator, Iterable
+from typing import Any, NamedTuple
+
+from smoothdiff._host_samples import Samples
+from smoothdiff._processes import NotImportableError, Processes, Seconds
+
+
+class AllHangError(RuntimeError):
+    """Every worker of a pool is in a call that cannot be ended."""
+
+
+# after these no call can be made
+_ENDS = concurrent.futures.BrokenExecutor, AllHangError, NotImportableError
+# what may be raised and is a fault of one call; Ctrl-C is none
+FAULTS = Exception, SystemExit
+
+
+class Outcome(NamedTuple):
+    """How a call ended; a call is known by its sample, and None is the one call of a batch."""
+
+    sample: int | None
+    tries: int
+    value: Any
+    error: BaseException | None
+
+
+class PoolLostError(Exception):
+    """An executor takes no more calls; `samples` are those that may have brought it down."""
+
+    def __init__(self, error: BaseException, samples: list[int | None]):
+        super().__init__(f"{type(error).__name__}: {error}")
+        self.samples = samples
+
+
+Outcomes = Generator[Outcome, None, None]
+# told of a sample and what the function returned for it
+Late = Callable[[int | None, Any], None]
+
+
+class InTurn:
+    """Calls in the thread that waits for them; a failed one goes to the end of the line."""
+
+    def outcomes(
+        self,
+        fun: Callable[..., Any],
+        samples: Samples,
+        which: Iterable[int | None],
+        retries: int,
+        timeout: Seconds,
+        late: Late,
+    ) -> Outcomes:
+        """As for `AtOnce`."""
+        del timeout, late  # for executors
+        line = deque((sample, 1) for sample in which)
+        while line:
+            sample, tries = line.popleft()
+            try:
+                outcome = Outcome(sample, tries, fun(*samples.arguments(sample)), None)
+            except FAULTS as error:
+                if tries <= retries:
+                    line.append((sample, tries + 1))
+                    continue
+                outcome = Outcome(sample, tries, None, error)
+            yield outcome
+
+
+@dataclasses.dataclass
+class _Call:
+    sample: int | None
+    tries: int
+    future: Any
+    # since when it is the oldest of those that have not come
+    oldest_since: float | None = None
+
+
+class AtOnce:
+    """Calls that an executor makes, several at once."""
+
+    # whether the executor itself ends calls that take too long
+    keeps_time = False
+
+    def __init__(self, executor: Any):
+        self._executor = executor
+        self._hung: list[Any] = []
+
+    def outcomes(
+        self,
+        fun: Callable[..., Any],
+        samples: Samples,
+        which: Iterable[int | None],
+        retries: int,
+        timeout: Seconds,
+        late: Late,
+    ) -> Outcomes:
+        """What each call returned or raised, as they come.
+
+        All are submitted together, so that no worker waits.
+
+        Args:
+            fun: the host function.
+            samples: its arguments.
+            which: the samples to call it for, None for all in one call.
+            retries: how often a call that failed is made again.
+            timeout: seconds that a call may take.
+            late: told of what comes when nobody waits for it anymore, in another thread.
+
+        Raises:
+            PoolLostError: the executor takes no more calls.
+        """
+        came: queue.SimpleQueue[int] = queue.SimpleQueue()
+        # those that have not come, in the order in which they began
+        calls: dict[int, _Call] = {}
+        tickets, patience = itertools.count(), None if self.keeps_time else timeout
+
+        def submit(sample: int | None, tries: int) -> None:
+            ticket = next(tickets)
+            calls[ticket] = _Call(sample, tries, None)
+            try:
+                future = self._submit(fun, samples, sample, timeout)
+            except RuntimeError as error:  # it was shut down, or is broken
+                raise PoolLostError(error, [call.sample for call in calls.values()]) from error
+            calls[ticket].future = future
+            future.add_done_callback(lambda _: came.put(ticket))
+
+        def give_up(call: _Call) -> None:
+            if call.future is not None and not call.future.cancel():
+                call.future.add_done_callback(functools.partial(_tell, late, call.sample))
+
+        try:
+            for sample in which:
+                submit(sample, 1)
+            while calls:
+                ticket = self._awaited(came, calls, patience)
+                call = calls[ticket]
+                try:
+                    value, error = self._result(call.future, timeout), None
+                except _ENDS:
+                    raise
+                except FAULTS as fault:
+                    value, error = None, fault
+                    give_up(call)
+                del calls[ticket]
+                if error is not None and call.tries <= retries:
+                    submit(call.sample, call.tries + 1)
+                else:
+                    yield Outcome(call.sample, call.tries, value, error)
+        except _ENDS as error:
+            raise PoolLostError(error, [call.sample for call in calls.values()]) from error
+        finally:
+            for call in calls.values():
+                give_up(call)
+
+    def _awaited(self, came: queue.SimpleQueue, calls: dict[int, _Call], timeout: Seconds) -> int:
+        """The ticket of the next call that came, or took longer than the timeout.
+
+        The clock runs for the oldest call alone. Executors begin calls in order, so it does not
+        count the wait for a worker, unless others use the executor too.
+        """
+        while True:
+            oldest, call = next(iter(calls.items()))
+            now = time.monotonic()
+            if call.oldest_since is None:
+                call.oldest_since = now
+            left = None if timeout is None else max(call.oldest_since + timeout - now, 0)
+            try:
+                ticket = came.get(timeout=left)
+            except queue.Empty:
+                if call.future.done() or self._begun(call.future):
+                    return oldest
+                call.oldest_since = None
+            else:
+                if ticket in calls:  # else it was given up before
+                    return ticket
+
+    def _submit(self, fun: Any, samples: Samples, sample: int | None, timeout: Seconds) -> Any:
+        """The future of a call."""
+        del timeout
+        return self._executor.submit(fun, *samples.arguments(sample))
+
+    def _begun(self, future: Any) -> bool:
+        """Whether a call has a worker, as far as that is known."""
+        del future
+        return True
+
+    def _result(self, future: Any, timeout: Seconds) -> Any:
+        if future.done():
+            return future.result()
+        self._stop(future)
+        raise TimeoutError(f"no result within {timeout} s")
+
+    def _stop(self, future: Any) -> None:
+        """Ends a call that takes too long; threads, and processes of others, cannot be ended."""
+        self._hung = [hung for hung in self._hung if not hung.done()]
+        if future.cancel() and self._hung:
+            raise AllHangError(
+                "no worker is left, each is in a call that took longer than the timeout and cannot "
+                "be ended; sd.Processes(4) replaces workers that hang"
+            )
+        self._hung.append(future)
+
+
+class Replaced(AtOnce):
+    """Calls in worker processes that are replaced when they die or hang."""
+
+    keeps_time = True
+
+    def _submit(self, fun: Any, samples: Samples, sample: int | None, timeout: Seconds) -> Any:
+        return self._executor.submit_within(timeout, fun, *samples.arguments(sample))
+
+
+Engine = InTurn | AtOnce
+
+
+def engine(executor: Any) -> Engine:
+    """How an executor is used.
+
+    Raises:
+        TypeError: it is none.
+    """
+    if executor is None:
+        return InTurn()
+    if isinstance(executor, Processes):
+        return Replaced(executor)
+    if isinstance(executor, concurrent.futures.Executor):
+        return AtOnce(executor)
+    raise TypeError(
+        "executor must be a concurrent.futures.Executor, such as ThreadPoolExecutor(4) or "
+        f"sd.Processes(4), not {executor!r}"
+    )
+
+
+def _tell(late: Late, sample: int | None, future: Any) -> None:
+    if not future.cancelled() and future.exception() is None:
+        late(sample, future.result())
