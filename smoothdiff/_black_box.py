@@ -56,9 +56,9 @@ def black_box(
             axis, of the same size everywhere, and its results must have it too. The size is 1
             outside `jax.vmap`; nested `jax.vmap` become one axis. If False, each sample is a call.
         executor: Where single calls run, several at once, each result taken when it comes: a
-            `concurrent.futures.Executor`, such as a `ThreadPoolExecutor`; or
-            `smoothdiff.Processes`, for functions that crash or hang. Processes must be spawned, as
-            a fork of JAX can hang.
+            `concurrent.futures.Executor`, such as a `ThreadPoolExecutor`; `smoothdiff.Processes`,
+            for functions that crash or hang; or the `distributed.Client` of a Dask cluster, for
+            many machines. Processes must be spawned, as a fork of JAX can hang.
         on_error: "raise", or "nan" so that a sample for which `fun` raises an exception, calls
             `sys.exit`, loses its worker or runs out of time is NaN in every output (the whole batch
             if `batched`). `nonfinite="drop"` in the transforms then leaves it out. A wrong
@@ -67,7 +67,7 @@ def black_box(
             outputs is NaN in every output.
         retries: How many times a call that failed is tried again. Takes no part in `on_nonfinite`.
         timeout: Seconds that a call may take. Needs an `executor`. `Processes` kill a worker that
-            takes longer, and begin another one. A thread goes on, and is lost to its
+            takes longer, and Dask does, and begin another one. A thread goes on, and is lost to its
             pool, as is a process of another pool; once all are lost, an error says so.
 
     Returns:

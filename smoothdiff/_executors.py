@@ -231,13 +231,18 @@ def engine(executor: Any) -> Engine:
     """
     if executor is None:
         return InTurn()
+    if type(executor).__module__.startswith("distributed."):
+        from smoothdiff._dask import OnDask
+
+        # a client, or what its get_executor() gives
+        return OnDask(getattr(executor, "_client", executor))
     if isinstance(executor, Processes):
         return Replaced(executor)
     if isinstance(executor, concurrent.futures.Executor):
         return AtOnce(executor)
     raise TypeError(
         "executor must be a concurrent.futures.Executor, such as ThreadPoolExecutor(4) or "
-        f"sd.Processes(4), not {executor!r}"
+        f"sd.Processes(4), or a distributed.Client of Dask, not {executor!r}"
     )
 
 

@@ -151,5 +151,5 @@ def test_results_are_taken_as_they_come():
 
 def test_what_is_no_executor():
     make = as_users_have_it(sd.black_box)
-    with pytest.raises(TypeError, match=r"sd\.Processes\(4\), not 4"):
+    with pytest.raises(TypeError, match=r"sd\.Processes\(4\), or a distributed\.Client"):
         make(host_functions.fault, 0.0, executor=4)

@@ -1,0 +1,93 @@
+"""Black boxes on the workers of a Dask cluster, here processes of this machine."""
+
+import host_functions
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import smoothdiff as sd
+
+distributed = pytest.importorskip("distributed")
+
+# Dask's own, as its workers come and go
+pytestmark = [pytest.mark.filterwarnings("ignore"), pytest.mark.usefixtures("quiet")]
+
+
+@pytest.fixture
+def quiet(caplog):
+    """Dask says a lot of workers that die."""
+    caplog.set_level("CRITICAL", "distributed")
+
+
+@pytest.fixture(scope="module")
+def client():
+    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
+    with distributed.LocalCluster(**options) as cluster, distributed.Client(cluster) as client:
+        yield client
+
+
+def box(executor, fun=host_functions.fault, **options):
+    return sd.black_box(fun, 0.0, executor=executor, **options)
+
+
+@pytest.mark.parametrize("way", ["client", "executor"])
+def test_a_client_is_an_executor(way, client):
+    executor = client if way == "client" else client.get_executor()
+    xs = jnp.array([0.25, 0.25, -0.5, 1.0])
+    many = jax.jit(jax.vmap(box(executor, on_error="nan")))(xs)
+    np.testing.assert_array_equal(many, [0.5, 0.5, -1.0, np.nan])
+    with pytest.raises(
+        sd.BlackBoxError, match="sample 3 of 4: raised ValueError: negative"
+    ) as info:
+        jax.vmap(box(executor))(xs)
+    assert "fault(array(1., dtype=float32))" in str(info.value)
+    pids = jax.vmap(sd.black_box(host_functions.process, 0, executor=executor))(xs)
+    assert len(set(pids.tolist())) == 2
+
+
+@pytest.mark.parametrize("way", ["client", "executor"])
+def test_a_call_that_failed_is_tried_again(way, client, tmp_path):
+    """Dask would take the second call for the first, and give the error again."""
+    flaky = host_functions.FirstTime(tmp_path, 1)
+    executor = client if way == "client" else client.get_executor()
+    f = box(executor, flaky, retries=1)
+    np.testing.assert_array_equal(jax.vmap(f)(jnp.arange(3.0)), [0.0, 2.0, 4.0])
+    assert flaky.tries() == {0.0: 2, 1.0: 2, 2.0: 2}
+
+
+def test_large_arguments_are_sent_once(client, monkeypatch):
+    sent = []
+    scatter = client.scatter
+    monkeypatch.setattr(client, "scatter", lambda a, **k: sent.append(a.nbytes) or scatter(a, **k))
+    f = box(client, host_functions.of_an_image)
+    scene = {"image": jnp.ones((512, 512)), "light": jnp.ones(3)}
+    for _ in range(2):
+        many = jax.jit(jax.vmap(f, in_axes=(0, None)))(jnp.arange(4.0), scene)
+        np.testing.assert_array_equal(many, 2.0**18 + np.arange(4.0))
+    assert sent == [4 * 2**18]
+
+
+def test_more_large_arrays_than_the_workers_keep(client):
+    f = box(client, host_functions.of_an_image)
+    scenes = {"image": jnp.ones((10, 512, 512)) * jnp.arange(10.0)[:, None, None]}
+    many = jax.vmap(f, in_axes=(None, 0))(0.0, scenes)
+    np.testing.assert_array_equal(many, 2.0**18 * np.arange(10.0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("at", [2, 3, 4, 5])
+def test_a_worker_that_dies_or_hangs_loses_its_call_alone(at, client):
+    xs = jnp.array([0.25, at, -0.5, 0.0, 0.0, 0.0])
+    f = box(client, on_error="nan", timeout=3.0)
+    want = [0.5, np.nan, -1.0, 0.0, 0.0, 0.0]
+    np.testing.assert_array_equal(jax.vmap(f)(xs), want)
+    with pytest.raises(sd.BlackBoxError, match="sample 1 of 6: raised"):
+        jax.vmap(box(client, timeout=3.0))(xs)
+    np.testing.assert_array_equal(jax.vmap(box(client))(xs.at[1].set(0.0)), [0.5, 0, -1, 0, 0, 0])
+
+
+@pytest.mark.slow
+def test_a_sample_whose_worker_died_is_tried_again(client, tmp_path):
+    flaky = host_functions.FirstTime(tmp_path, 2)
+    np.testing.assert_array_equal(jax.vmap(box(client, flaky))(jnp.arange(2.0)), [0.0, 2.0])
