@@ -32,6 +32,7 @@ from smoothdiff._solvers.local_gauss_newton import LocalGaussNewton
 from smoothdiff._solvers.newton_cg import NewtonCG
 from smoothdiff._solvers.zerograds import ZeroGrads
 from smoothdiff._spaces import AbstractSpace
+from smoothdiff._store import Evaluation, load_store
 from smoothdiff._support import local_support, matrix_support, moving_support, probe_support
 from smoothdiff._unbounded import Periodic, Positive, Real
 from smoothdiff._with_covariance import with_covariance
@@ -44,6 +45,7 @@ __all__ = [
     "AbstractSpace",
     "Aggregate",
     "BlackBoxError",
+    "Evaluation",
     "FirstOrder",
     "GaussNewton",
     "Gaussian",
@@ -82,6 +84,7 @@ __all__ = [
     "kernels",
     "large_steps",
     "least_squares",
+    "load_store",
     "local_support",
     "matrix_support",
     "minimise",

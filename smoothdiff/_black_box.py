@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -16,6 +17,7 @@ from smoothdiff._host_samples import BlackBoxError, Samples, wait_for
 from smoothdiff._outputs import Outputs
 from smoothdiff._params import is_concrete
 from smoothdiff._reraise import reraise, was_raised
+from smoothdiff._store import Store
 
 
 class UnknownOutputError(TypeError):
@@ -32,6 +34,7 @@ def black_box(
     on_nonfinite: str = "raise",
     retries: int = 0,
     timeout: int | float | None = None,
+    store: str | os.PathLike | None = None,
 ) -> Callable[..., Any]:
     """Turns a host function of NumPy arrays, such as a renderer, into a JAX function.
 
@@ -69,6 +72,11 @@ def black_box(
         timeout: Seconds that a call may take. Needs an `executor`. `Processes` kill a worker that
             takes longer, and Dask does, and begin another one. A thread goes on, and is lost to its
             pool, as is a process of another pool; once all are lost, an error says so.
+        store: A file that keeps each point and its value as it comes. What is there is not
+            evaluated again, whether the run went on, failed, was killed or is made once more; so
+            `fun` must give the same value again. Neither errors nor NaN are kept. Several processes
+            may use the file; it is an SQLite database, so on a disk of this machine. It is of one
+            function, as checkpoints are. `smoothdiff.load_store` reads it.
 
     Returns:
         A JAX function with the name and docstring of `fun`.
@@ -80,7 +88,8 @@ def black_box(
         TypeError: If `fun`, `out` or `executor` is of the wrong type; later, if the function is
             differentiated or called with a typed key, or if JAX traces it before a call has found
             `out`.
-        ValueError: If the options contradict each other.
+        ValueError: If the options contradict each other; later, if the store is of another
+            function.
 
     Example:
         >>> import jax, jax.numpy as jnp, numpy as np
@@ -105,6 +114,7 @@ def black_box(
         >>> with sd.Processes(4) as workers:  # doctest: +SKIP
         ...     f = sd.black_box(
         ...         simulate, 0.0, executor=workers, timeout=60, retries=1, on_error="nan",
+        ...         store="runs/simulate.db",
         ...     )
         ...     result = sd.minimise(lambda y, args: f(y), y0, key=key)
     """
@@ -118,20 +128,24 @@ def black_box(
             on_nonfinite=on_nonfinite,
             retries=retries,
             timeout=timeout,
+            store=store,
         )
     if not callable(fun):
         raise TypeError(
             f"black_box needs a function of NumPy arrays, not {fun!r}; what it returns is out=..."
         )
     name = getattr(fun, "__name__", type(fun).__name__)
+    kept = Store(store, fun) if isinstance(store, str | os.PathLike) else None
     nan = on_error, on_nonfinite
-    host = HostFunction(fun, name, batched, engine(executor), *nan, retries, timeout)
-    _check(host)
+    host = HostFunction(fun, name, batched, engine(executor), *nan, retries, timeout, kept)
+    _check(host, store)
     promised = None if out is None else _jax_function(host, Outputs.like(out))
     found = _Found()
 
     @functools.wraps(fun)
     def box(*args):
+        if kept is not None:
+            kept.check()
         args = jax.tree.map(_array, args)
         leaves, tree = jax.tree.flatten(args)
         shapes = tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves)
@@ -244,7 +258,9 @@ def _array(leaf: Any) -> jax.Array:
     return array
 
 
-def _check(host: HostFunction) -> None:
+def _check(host: HostFunction, store: Any) -> None:
+    if not isinstance(store, str | os.PathLike | None):
+        raise TypeError(f"store must be a path of a file, not {store!r}")
     for option in ("on_error", "on_nonfinite"):
         value = getattr(host, option)
         if value not in ("raise", "nan"):

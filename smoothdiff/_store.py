@@ -1,0 +1,262 @@
+"""A file of evaluations: each point and its value as they come, so that none is paid for twice."""
+
+import ast
+import contextlib
+import json
+import os
+import re
+import sqlite3
+import threading
+import time
+import warnings
+import weakref
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import PyTree
+
+from smoothdiff._digest import digest_of
+from smoothdiff._host_samples import Samples
+from smoothdiff._identity import Identity, can_change, listed
+
+# seconds to wait for another process that writes
+_PATIENCE = 60.0
+# An array stands there once, however many points share it; points and values name arrays by their
+# digests. The order of the rows is that in which they came.
+_TABLES = """
+create table if not exists function (part text primary key, digest text);
+create table if not exists arrays (id text primary key, dtype text, shape text, data blob);
+create table if not exists evaluations (point text primary key, value text);
+"""
+
+
+class Evaluation(NamedTuple):
+    """What a function was called with, and what it returned.
+
+    Attributes:
+        args: its arguments.
+        value: its value there.
+    """
+
+    args: tuple
+    value: PyTree[np.ndarray]
+
+
+def load_store(path: str | os.PathLike) -> list[Evaluation]:
+    """The evaluations in the file of a `black_box(..., store=path)`, in the order they came.
+
+    The file can be read while it grows. It is an SQLite database without pickles.
+
+    Args:
+        path: the file.
+
+    Returns:
+        Pairs (args, value) of NumPy arrays in tuples, lists and dicts as they were. What was in
+        nodes of other kinds, such as modules of equinox, is a tuple of the arrays in them.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is another kind of file.
+
+    Example:
+        >>> import tempfile, jax, jax.numpy as jnp, numpy as np, smoothdiff as sd
+        >>> path = tempfile.mktemp()
+        >>> f = sd.black_box(lambda y: np.abs(y - 1).sum(), 0.0, store=path)
+        >>> values = jax.vmap(f)(jnp.arange(4.0)[:, None])
+        >>> [float(value) for _, value in sd.load_store(path)]
+        [1.0, 0.0, 1.0, 2.0]
+
+        A search that begins with them:
+
+        >>> search = sd.Search(jnp.zeros(1), key=jax.random.key(0))
+        >>> known = sd.load_store(path)
+        >>> search.tell([y for (y,), _ in known], [value for _, value in known])
+        >>> search.y
+        Array([1.], dtype=float32)
+
+    Source: own.
+    """
+    if not Path(path).exists():
+        raise FileNotFoundError(f"there is no store {path}")
+    with _translated(Path(path)), contextlib.closing(_connected(Path(path))) as file:
+        rows = file.execute("select point, value from evaluations order by rowid").fetchall()
+        return [Evaluation(*(_read(file, text).tree() for text in row)) for row in rows]
+
+
+class Found(NamedTuple):
+    """Arrays, and their places in a tree as the text of a literal, where that is possible."""
+
+    leaves: list[np.ndarray]
+    places: str
+
+    def tree(self, flat: bool = True) -> PyTree[np.ndarray]:
+        """The arrays in their tree; or all in a tuple, unless a ValueError is to be raised then."""
+        try:
+            return jax.tree.map(self.leaves.__getitem__, ast.literal_eval(self.places))
+        except (ValueError, SyntaxError) as error:
+            if flat:
+                return tuple(self.leaves)
+            raise ValueError(f"no literal: {self.places}") from error
+
+
+class Store:
+    """The evaluations of one function; several processes may have it open."""
+
+    def __init__(self, path: str | os.PathLike, fun: Callable[..., Any]):
+        """Names the file, which is made, with its directory, when it is first needed."""
+        self._path, self._fun = Path(path), fun
+        self._identity: Identity | None = None
+        self._settled = False
+        # open all the time, as the last one who closes the file waits for the disk; callbacks run
+        # in threads of JAX's
+        self._connection: sqlite3.Connection | None = None
+        self._lock = threading.RLock()
+
+    def check(self) -> None:
+        """Makes the file, or sees whether it is of this function; once.
+
+        Raises:
+            ValueError: the file is no store, or that of another function.
+        """
+        if self._identity is not None:
+            return
+        identity = Identity(fun=self._fun)
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        _make(self._path)
+        with self._opened() as file:
+            file.execute("begin immediate")
+            kept = dict(file.execute("select part, digest from function"))
+            if not kept:
+                file.executemany("insert into function values (?, ?)", identity.parts.items())
+                kept = identity.parts
+            file.execute("commit")
+        differ = identity.differing(kept)
+        what = f"the store {self._path} was written when {listed(differ)} was another"
+        if not all(map(can_change, differ)):
+            raise ValueError(
+                f"{what}: name another file. If the function still returns the same values, forget "
+                f"what it was: with sqlite3.connect({str(self._path)!r}) as file: "
+                'file.execute("delete from function")'
+            )
+        if differ:
+            warnings.warn(f"{what}; its values are taken as they are", RuntimeWarning, stacklevel=3)
+        self._identity = identity
+
+    def settle(self) -> None:
+        """What the first calls have changed in the function does not tell it from others."""
+        if self._identity is None or self._settled:
+            return
+        self._settled = True
+        if changed := [(name,) for name in self._identity.settle()]:
+            query = "update function set digest = null where part = ?"
+            self._try(lambda file: file.executemany(query, changed), "written to")
+
+    def find(self, samples: Samples) -> list[Found | None]:
+        """The values of the samples that are there, else None."""
+        query = "select value from evaluations where point = ?"
+        found: list[Found | None] = [None] * len(samples)
+
+        def read(file: sqlite3.Connection) -> None:
+            for i in range(len(samples)):
+                point, _ = _described(samples.leaves(i), samples.tree, samples.digest)
+                if row := file.execute(query, (point,)).fetchone():
+                    found[i] = _read(file, row[0])
+
+        self._try(read, "read from")
+        return found
+
+    def put(self, samples: Samples, i: int, value: Sequence[np.ndarray], out_tree: Any) -> None:
+        """Keeps the value of sample `i`, as leaves; it is on the disk when this returns."""
+        point, arrays = _described(samples.leaves(i), samples.tree, samples.digest)
+        text, more = _described(value, out_tree, digest_of)
+
+        def write(file: sqlite3.Connection) -> None:
+            for name, array in (arrays | more).items():
+                # a look first, as binding a large array takes its time
+                if not file.execute("select 1 from arrays where id = ?", (name,)).fetchone():
+                    row = name, str(array.dtype), json.dumps(array.shape), array.tobytes()
+                    file.execute("insert into arrays values (?, ?, ?, ?)", row)
+            file.execute("insert or replace into evaluations values (?, ?)", (point, text))
+
+        self._try(write, "written to")
+
+    def _try(self, use: Callable[[sqlite3.Connection], Any], what: str) -> None:
+        """Uses the file; if that fails, values have to be paid for again, and all else goes on."""
+        try:
+            with self._opened() as file:
+                if what == "written to":
+                    file.execute("begin immediate")
+                use(file)
+                if file.in_transaction:
+                    file.execute("commit")
+        except (sqlite3.Error, ValueError) as error:
+            text = f"nothing was {what} the store {self._path}, the calls go on: {error}"
+            warnings.warn(text, RuntimeWarning, stacklevel=3)
+
+    @contextlib.contextmanager
+    def _opened(self) -> Iterator[sqlite3.Connection]:
+        """The file, for one thread at a time; what was not committed is undone."""
+        with self._lock, _translated(self._path):
+            if self._connection is None or not self._path.exists():  # deleted, it would be kept
+                self._connection = _connected(self._path)
+                weakref.finalize(self, self._connection.close)
+            try:
+                yield self._connection
+            finally:
+                if self._connection.in_transaction:
+                    self._connection.rollback()
+
+
+def _connected(path: Path) -> sqlite3.Connection:
+    file = sqlite3.connect(path, _PATIENCE, isolation_level=None, check_same_thread=False)
+    # what was written outlives a kill
+    file.execute("pragma synchronous = normal")
+    return file
+
+
+def _make(path: Path) -> None:
+    """Makes the tables, if there are none."""
+    end = time.monotonic() + _PATIENCE
+    while True:
+        try:
+            with _translated(path), contextlib.closing(_connected(path)) as file:
+                # others read while one writes
+                file.execute("pragma journal_mode = wal")
+                file.executescript(_TABLES)
+                return
+        except sqlite3.OperationalError:  # several begin at once, and SQLite does not wait here
+            if time.monotonic() > end:
+                raise
+            time.sleep(0.01)
+
+
+@contextlib.contextmanager
+def _translated(path: Path) -> Iterator[None]:
+    """The error of a file that is none of SQLite's says what to do."""
+    try:
+        yield
+    except sqlite3.DatabaseError as error:
+        if isinstance(error, sqlite3.OperationalError):  # locked, full, gone
+            raise
+        raise ValueError(f"{path} is not a store of evaluations: name another file") from error
+
+
+def _described(
+    leaves: Sequence[np.ndarray], tree: Any, digest: Callable[[np.ndarray], bytes]
+) -> tuple[str, dict[str, np.ndarray]]:
+    """What arguments or a value are, as text that names the arrays, and these by name."""
+    names = [digest(leaf).hex() for leaf in leaves]
+    places = repr(tree.unflatten(range(len(names))))
+    text = json.dumps([re.sub(r" at 0x[0-9a-f]+", "", places), names])
+    return text, dict(zip(names, leaves, strict=True))
+
+
+def _read(file: sqlite3.Connection, text: str) -> Found:
+    """What the text describes."""
+    places, names = json.loads(text)
+    query = "select dtype, shape, data from arrays where id = ?"
+    rows = (file.execute(query, (name,)).fetchone() for name in names)
+    return Found([np.frombuffer(c, a).reshape(json.loads(b)) for a, b, c in rows], places)
