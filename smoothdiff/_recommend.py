@@ -10,13 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from smoothdiff._black_box import UnknownOutputError, reraise
+from smoothdiff._black_box import UnknownOutputError
 from smoothdiff._call_checks import check_call, check_number, check_residuals, explained
 from smoothdiff._default_solver import default_solver
 from smoothdiff._host_steps import evaluator, rows_at
 from smoothdiff._limits import Limits
 from smoothdiff._look_around import WIDEST, View, look_around
 from smoothdiff._params import as_key, take_apart
+from smoothdiff._reraise import reraise
 from smoothdiff._run import inexact
 from smoothdiff._unit_space import UnitSpace
 

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PyTree
 
-from smoothdiff._black_box import reraise
 from smoothdiff._covariance import Slopes, slopes
 from smoothdiff._host_steps import evaluator, rows_at
 from smoothdiff._parameter_errors import Answer
 from smoothdiff._params import layout_of
+from smoothdiff._reraise import reraise
 from smoothdiff._result import NO_COVARIANCE, Result, kept_residuals
 
 # how far from the answer, in standard errors: the ends of 95 % intervals
