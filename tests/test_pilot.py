@@ -56,7 +56,9 @@ def test_the_nearest_change_says_how_far_the_first_points_are(changed, good, len
     assert (int(pilot.tried), float(pilot.length)) == (2, length)
 
 
-@pytest.mark.parametrize("run", [sd.minimise, sd.least_squares])
+@pytest.mark.parametrize(
+    "run", [pytest.param(sd.minimise, marks=pytest.mark.slow), sd.least_squares]
+)
 def test_a_sigma_that_is_far_too_small_costs_few_evaluations(run):
     fun, first = (plateaus, 5) if run is sd.minimise else (terraces, 3)
     for sigma in (0.1, 0.01):

@@ -324,7 +324,11 @@ def test_a_large_array_that_all_points_share_is_there_once(path):
     assert [args[1].shape for args, _ in sd.load_store(path)] == [(256, 256)] * 20
 
 
-@pytest.mark.parametrize("solver", [sd.NewtonCG(0.2), None], ids=["given", "default"])
+@pytest.mark.parametrize(
+    "solver",
+    [pytest.param(sd.NewtonCG(0.2), marks=pytest.mark.slow), None],
+    ids=["given", "default"],
+)
 def test_a_run_that_is_made_again_costs_nothing_and_gives_the_same_bits(solver, path):
     def once():
         host = Counted()
