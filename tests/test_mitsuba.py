@@ -166,6 +166,53 @@ def test_motions_are_scale_then_rotate_then_translate():
     np.testing.assert_allclose(actual, picture(expected), atol=1e-4)
 
 
+def turn(vector):
+    angle = np.linalg.norm(vector)
+    return T().rotate((vector / angle).tolist(), float(np.degrees(angle)))
+
+
+def test_without_an_axis_a_rotation_is_a_vector():
+    turns = mitsuba.renderer(scene(), ["cube.rotate", "board.rotate"], axis={"board": (0, 0, 1)})
+    assert {name: value.shape for name, value in turns.initial.items()} == {
+        "cube.rotate": (3,),
+        "board.rotate": (),
+    }
+    start = turns(turns.initial)
+    np.testing.assert_allclose(start, picture(scene(), spp=0), atol=1e-6)
+    vector = np.array([0.3, -0.5, 0.4])
+    motion = about(CUBE, turn(vector))
+    expected = picture(scene(cube=scene()["cube"] | {"to_world": motion @ CUBE_TO_WORLD}), spp=0)
+    turned = turns({"cube.rotate": jnp.asarray(vector), "board.rotate": jnp.array(0.0)})
+    assert np.abs(expected - start).max() > 0.01
+    np.testing.assert_allclose(turned, expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["perspective", "orthographic"])
+def test_a_pose_of_a_camera_is_a_parameter(kind):
+    def view(moved=None, fov=35.0, zoom=1.0):
+        plain = camera()
+        to_world = plain["to_world"] if moved is None else moved(plain["to_world"])
+        if kind == "perspective":
+            return {**plain, "fov": fov, "to_world": to_world}
+        film = plain["film"]
+        return {"type": kind, "film": film, "to_world": to_world @ T().scale([zoom, zoom, 1])}
+
+    move, vector = [0.2, 0.1, -0.3], np.array([0.02, 0.05, 0.04])
+    origin = [0, -6, 3]
+    values = {"camera.translate": jnp.asarray(move), "camera.rotate": jnp.asarray(vector)}
+    if kind == "perspective":
+        values["camera.x_fov"], seen = jnp.array(30.0), {"fov": 30.0}
+    else:
+        values["camera.scale"], seen = jnp.array(1.2), {"zoom": 1.2}
+    wanted = view(lambda pose: T().translate(move) @ about(origin, turn(vector)) @ pose, **seen)
+    render = mitsuba.renderer(scene(camera=view()), list(values), spp=4)
+    start = render(render.initial)
+    np.testing.assert_allclose(start, picture(scene(camera=view())), atol=1e-6)
+    expected = picture(scene(camera=wanted))
+    assert np.abs(expected - start).max() > 0.01
+    np.testing.assert_allclose(render(values), expected, atol=1e-4)
+
+
 def test_a_mesh_keeps_the_normals_of_its_file():
     mesh = mi.load_dict({"type": "cube", "to_world": T().scale(0.5)})
     assert isinstance(mesh, mi.Mesh)
@@ -378,9 +425,8 @@ def test_vectorised_variants_render_the_same_scene(variant):
         (["ball.scale", "ball.scale"], {}, "each once"),
         (["ball.scale", "ball.to_world"], {}, "cannot be varied together"),
         (["cube.scale", "cube.vertex_positions"], {}, "cannot be varied together"),
-        ("ball.rotate", {}, r"needs axis="),
-        ("ball.rotate", {"axis": (0, 0, 0)}, r"needs axis="),
-        ("ball.rotate", {"axis": {"cube": (0, 0, 1)}}, r"needs axis="),
+        ("ball.rotate", {"axis": (0, 0, 0)}, r"axis=\(x, y, z\)"),
+        ("ball.rotate", {"axis": {"ball": (0, 1)}}, r"axis=\(x, y, z\)"),
         ("ball.scale", {"noise": "white"}, "per_params"),
         ("ball.scale", {"seed": -1}, "seed"),
         ("ball.scale", {"seed": 2**32}, "seed"),

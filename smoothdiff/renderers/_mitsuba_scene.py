@@ -29,10 +29,11 @@ _MIN_LLVM = 17
 
 Axis: TypeAlias = Sequence[int | float]
 
-# Values of the rigid motions when the object stays where the scene has it.
+# Values of the motions when the object stays where the scene has it; with an axis a rotation has
+# one number.
 _MOTIONS = {
     "translate": np.zeros(3, np.float32),
-    "rotate": np.zeros((), np.float32),
+    "rotate": np.zeros(3, np.float32),
     "scale": np.ones((), np.float32),
 }
 
@@ -159,10 +160,11 @@ class Scene:
         return now is None or now.tobytes() != value.tobytes()
 
 
-def initial_value(scene: Scene, name: str) -> np.ndarray:
-    """The value that a parameter starts from, be it the scene's own or a rigid motion."""
+def initial_value(scene: Scene, name: str, axes: Mapping[str, Axis]) -> np.ndarray:
+    """The value that a parameter starts from, be it the scene's own or a motion."""
     if motion := as_motion(scene, name):
-        return _MOTIONS[motion[1]]
+        angle = motion[1] == "rotate" and motion[0] in axes
+        return np.zeros((), np.float32) if angle else _MOTIONS[motion[1]]
     if name in scene.names and _is_float(scene.initial(name)):
         return scene.initial(name)
     names = [key for key in scene.names if _is_float(scene.initial(key))]
@@ -178,7 +180,7 @@ def initial_value(scene: Scene, name: str) -> np.ndarray:
 
 
 def as_motion(scene: Scene, name: str) -> tuple[str, str] | None:
-    """The object and the kind of rigid motion that a name stands for, if it does."""
+    """The object and the kind of motion that a name stands for, if it does."""
     thing, _, motion = name.rpartition(".")
     places = {f"{thing}.to_world", f"{thing}.vertex_positions"}
     return (thing, motion) if motion in _MOTIONS and not places.isdisjoint(scene.names) else None
@@ -187,12 +189,12 @@ def as_motion(scene: Scene, name: str) -> tuple[str, str] | None:
 def scene_values(
     scene: Scene, values: Mapping[str, np.ndarray], axes: Mapping[str, Axis]
 ) -> dict[str, np.ndarray]:
-    """The scene's own parameters for given ones, rigid motions among them.
+    """The scene's own parameters for given ones, motions among them.
 
     Args:
         scene: The scene.
         values: By name.
-        axes: Unit vector by name of the object, for those that rotate.
+        axes: Unit vector by name of the object, for those that rotate about one.
     """
     own, moving = {}, {}
     for name, value in values.items():
@@ -201,7 +203,9 @@ def scene_values(
         else:
             own[name] = value
     for thing, motions in moving.items():
-        moved = _move(scene, thing, axes.get(thing, (0, 0, 1)), **(_MOTIONS | motions))
+        if thing in axes and "rotate" in motions:
+            motions["rotate"] = motions["rotate"] * np.asarray(axes[thing])
+        moved = _move(scene, thing, **(_MOTIONS | motions))
         if clash := own.keys() & moved.keys():
             raise ValueError(f"{clash} cannot be varied together with motions of {thing!r}")
         own |= moved
@@ -211,13 +215,14 @@ def scene_values(
 def _move(
     scene: Scene,
     thing: str,
-    axis: Axis,
     translate: np.ndarray,
     rotate: np.ndarray,
     scale: np.ndarray,
 ) -> dict[str, np.ndarray]:
     """An object from where the scene came with it, scaled, then rotated, then translated."""
-    turn = mi.ScalarTransform4f().rotate(axis, np.degrees(rotate))
+    angle = np.linalg.norm(rotate)
+    axis = (rotate / angle).tolist() if angle > 0 else (0, 0, 1)
+    turn = mi.ScalarTransform4f().rotate(axis, float(np.degrees(angle)))
     rotation = np.array(turn.matrix, np.float64)[:3, :3]
     if f"{thing}.to_world" in scene.names:
         pose = scene.initial(f"{thing}.to_world").astype(np.float64)

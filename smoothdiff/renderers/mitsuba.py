@@ -54,12 +54,16 @@ def renderer(
             it takes a dict from name to array. A name is a key of `mitsuba.traverse(scene)`, such
             as `"ball.bsdf.reflectance.value"` or `"lamp.position"`, with the shape that the value
             has there; or a motion of a shape, camera or light, from where the scene has it:
-            `"ball.translate"` (3 numbers, scene units), `"ball.rotate"` (1 number, radians),
-            `"ball.scale"` (1 number, a factor). Objects are scaled, then rotated, then translated;
-            the first two about their own origin, which is the translation of their `to_world` or,
-            for a mesh without one, the centre of its bounding box.
+            `"ball.translate"` (3 numbers, scene units), `"ball.rotate"` (radians: 1 number about
+            an `axis`, without one 3 numbers, a rotation vector in world space), `"ball.scale"` (1
+            number, a factor). Objects are scaled, then rotated, then translated; the first two
+            about their own origin, which is the translation of their `to_world` or, for a mesh
+            without one, the centre of its bounding box. So a camera's pose is
+            `["camera.translate", "camera.rotate"]`, its field of view `"camera.x_fov"` (degrees),
+            and what an orthographic one sees `"camera.scale"`.
         axis: Direction in world space that `"NAME.rotate"` turns about, anti-clockwise for a viewer
-            that it points at; or a dict from object to direction, `{"mug": (0, 0, 1)}`.
+            that it points at; or a dict from object to direction, `{"mug": (0, 0, 1)}`. Others
+            turn about any.
         resolution: Pixels, `(height, width)` or the side of a square. None: as the scene says.
         spp: Samples per pixel. None: as the scene says.
         integrator: The type of a Mitsuba integrator, such as `"direct"`, a dict as for
@@ -108,8 +112,8 @@ def renderer(
     with mitsuba_with(variant):
         loaded = Scene.of(scene)
         integrator = _integrator(loaded, integrator)
-        initial = {name: initial_value(loaded, name) for name in names}
         axes = _axes(loaded, names, axis)
+        initial = {name: initial_value(loaded, name, axes) for name in names}
         scene_values(loaded, initial, axes)  # raises if two names speak of the same thing
         films, size = _films(loaded, views, resolution)
     shape = size if isinstance(sensor, int) else (len(views), *size)
@@ -210,16 +214,16 @@ def _axes(
     names: Sequence[str],
     axis: Axis | Mapping[str, Axis] | None,
 ) -> dict[str, Axis]:
-    """Unit vectors by object, for those that rotate."""
+    """Unit vectors by object, for those that rotate about one."""
     axes = {}
     for thing, motion in filter(None, (as_motion(loaded, name) for name in names)):
-        if motion == "rotate":
-            chosen = axis.get(thing) if isinstance(axis, Mapping) else axis
-            direction = np.zeros(3) if chosen is None else np.asarray(chosen, float)
+        chosen = axis.get(thing) if isinstance(axis, Mapping) else axis
+        if motion == "rotate" and chosen is not None:
+            direction = np.asarray(chosen, float)
             if direction.shape != (3,) or not np.linalg.norm(direction) > 0:
                 raise ValueError(
-                    f"'{thing}.rotate' needs axis=(x, y, z), the direction that it turns about, or "
-                    f"axis={{{thing!r}: (x, y, z)}}; got {axis}"
+                    f"'{thing}.rotate' turns about axis=(x, y, z) or axis={{{thing!r}: (x, y, z)}},"
+                    f" and without it about any; got {axis}"
                 )
             axes[thing] = (direction / np.linalg.norm(direction)).tolist()
     return axes
