@@ -21,7 +21,7 @@ _HOST = (
 )
 
 
-def check_call(fun: Any, y0: Any, bounds: Any, space: Any) -> None:
+def check_call(fun: Any, y0: Any, bounds: Any, space: Any, takes_key: bool = False) -> None:
     """Raises TypeError or ValueError for arguments in another order or of another library."""
     solvers = AbstractSmoothSolver | optx.AbstractIterativeSolver
     if isinstance(fun, solvers) or callable(y0) or isinstance(y0, solvers):
@@ -33,10 +33,14 @@ def check_call(fun: Any, y0: Any, bounds: Any, space: Any) -> None:
         raise TypeError(f"fun must be a function of (y, args), not {type(fun).__name__}")
     with contextlib.suppress(ValueError):  # some builtins have no signature
         try:
-            inspect.signature(fun).bind(y0, None)
+            inspect.signature(fun).bind(*((y0, None, None) if takes_key else (y0, None)))
         except TypeError as error:
             raise TypeError(
-                "fun is called as fun(y, args): write lambda y, args: fun(y) if it takes y alone"
+                "with takes_key=True fun is called as fun(y, args, key): leave it out if fun takes "
+                "no key, and write lambda y, args, key: fun(y, key) if it takes no args"
+                if takes_key
+                else "fun is called as fun(y, args): write lambda y, args: fun(y) if it takes y "
+                "alone, and takes_key=True if it takes a key: fun(y, args, key)"
             ) from error
     pairs = (
         isinstance(bounds, tuple | list) and len(bounds) > 0 and not isinstance(y0, tuple | list)

@@ -16,8 +16,10 @@ from smoothdiff._params import layout_of
 from smoothdiff._run import Problem
 from smoothdiff._solvers._base import smoothed_params
 from smoothdiff._solvers._evaluator import Evaluator
+from smoothdiff._solvers._judgement import Values
 from smoothdiff._solvers._point_by_point import PointState, PointStep
 from smoothdiff._solvers._point_search import AbstractPointSearch, Sizes
+from smoothdiff._solvers._random_numbers import in_round, takes_key
 
 # with a history of fewer numbers a step is short, and compiling it well would take longer than all
 # of the steps
@@ -50,24 +52,25 @@ class HostProblem(Problem):
     def step(self, y: PyTree, state: PointState) -> tuple[PyTree, PointState, Bool[Array, ""]]:
         """The next evaluations, between what is compiled for the stage of the search."""
         points, proposal = self.host.propose(y, state)
-        rows = _rows(self._evaluator(y), points)
+        args = self.host.parts(y, state).numbers(self.args)
+        rows = _rows(self._evaluator(args, y), points)
         return self.host.told(y, state, points, rows, proposal)
 
     def judge(self, y: PyTree, state: PointState) -> tuple[PyTree, dict[str, Any]]:
         """Decided on the host, so that nothing is compiled for it."""
-        evaluate = self._evaluator(y)
 
-        def values(points: PyTree[Array]) -> Array:
+        def at(points: PyTree[Array], number: Array) -> Array:
+            args = in_round(self.args, self.options, number)
+            evaluate = self._evaluator(args, y)
             vectors = jax.vmap(lambda y: evaluate.layout.vector(jax.tree.leaves(y)))(points)
             return evaluate.funs(rows_at(evaluate, vectors, self.host.sizes.step))
 
+        values = Values(at, takes_key(self.options))
         return self.host.parts(y, state).judge(values, _loop)
 
-    def _evaluator(self, y: PyTree) -> Evaluator:
+    def _evaluator(self, args: PyTree, y: PyTree) -> Evaluator:
         solver = self.solver
-        return evaluator(
-            self.fun, solver.squares, self.args, y, getattr(solver, "batch_size", None)
-        )
+        return evaluator(self.fun, solver.squares, args, y, getattr(solver, "batch_size", None))
 
 
 class HostSteps(eqx.Module):

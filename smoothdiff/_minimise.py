@@ -25,6 +25,8 @@ from smoothdiff._limits import Limits
 from smoothdiff._result import MinimiseError, Record, Result
 from smoothdiff._run import Problem, Run, inexact
 from smoothdiff._solvers import AbstractSmoothSolver
+from smoothdiff._solvers._base import write_options
+from smoothdiff._solvers._random_numbers import keyed
 from smoothdiff._solvers._wrapped import Wrapped
 from smoothdiff._unit_space import UnitSpace
 
@@ -33,7 +35,7 @@ _MANY = 10_000
 
 
 def minimise(
-    fun: Callable[[PyTree, PyTree], Any],
+    fun: Callable[..., Any],
     y0: PyTree,
     args: PyTree = None,
     *,
@@ -46,6 +48,7 @@ def minimise(
     max_seconds: float | None = None,
     space: PyTree = None,
     bounds: tuple[PyTree, PyTree] | None = None,
+    takes_key: bool = False,
     callback: Callable[[Record], Any] | None = None,
     progress: bool = False,
     keep_iterates: bool | None = None,
@@ -89,6 +92,13 @@ def minimise(
             pytree like `y0` of spaces and None. The solver then searches in unit coordinates, in
             which sigma is given; `fun`, the records and the result have natural values.
         bounds: a pair (low, high), each a number or a pytree like `y0`. `fun` sees no other points.
+        takes_key: whether `fun` draws random numbers. It is called as `fun(y, args, key)`, and its
+            mean over keys is minimised: one fixed key has a minimum of its own. A step has one key,
+            the next a fresh one; with fewer than 100 parameters, all that the local model compares
+            has one. Where that ends, rounds of samples follow until a limit ends the run, and `y`
+            is the mean of their centers, unless with three fresh keys another point is clearly
+            lower. A black box takes a seed: `lambda y, args, key: box(y, jax.random.bits(key))`.
+            Under optimistix args is (args, key), with the option `"takes_key": True`.
         callback: called with each step's `Record`; the run stops if it returns something true.
         progress: show a progress bar, which says "compiling" in the first step, and in the first of
             each kind.
@@ -121,13 +131,13 @@ def minimise(
     """
     limits = max_steps, max_evaluations, max_seconds, target
     kind = optx.AbstractMinimiser, "NewtonCG", check_number
-    chosen, where = (solver, sigma, None), (space, bounds)
+    chosen, where = (solver, sigma, None), (space, bounds, takes_key)
     loop = _Loop(callback, progress, keep_iterates, checkpoint)
     return _run(kind, fun, y0, args, key, chosen, where, limits, loop)
 
 
 def least_squares(
-    fun: Callable[[PyTree, PyTree], Any],
+    fun: Callable[..., Any],
     y0: PyTree,
     args: PyTree = None,
     *,
@@ -141,6 +151,7 @@ def least_squares(
     max_seconds: float | None = None,
     space: PyTree = None,
     bounds: tuple[PyTree, PyTree] | None = None,
+    takes_key: bool = False,
     callback: Callable[[Record], Any] | None = None,
     progress: bool = False,
     keep_iterates: bool | None = None,
@@ -169,6 +180,7 @@ def least_squares(
         max_seconds: as for `minimise`.
         space: as for `minimise`.
         bounds: as for `minimise`.
+        takes_key: as for `minimise`; half the sum of squares of the residuals' means is minimised.
         callback: as for `minimise`.
         progress: as for `minimise`.
         keep_iterates: as for `minimise`.
@@ -196,7 +208,7 @@ def least_squares(
     """
     limits = max_steps, max_evaluations, max_seconds, target
     kind = optx.AbstractLeastSquaresSolver, "GaussNewton", check_residuals
-    chosen, where = (solver, sigma, support), (space, bounds)
+    chosen, where = (solver, sigma, support), (space, bounds, takes_key)
     loop = _Loop(callback, progress, keep_iterates, checkpoint)
     return _run(kind, fun, y0, args, key, chosen, where, limits, loop)
 
@@ -217,13 +229,14 @@ def _run(
     args: PyTree,
     key: Any,
     chosen: tuple[Any, PyTree, Any],
-    where: tuple[PyTree, Any],
+    where: tuple[PyTree, Any, bool],
     limits: tuple[Any, ...],
     loop: _Loop,
 ) -> Result:
     (interface, example, check), (solver, sigma, support) = kind, chosen
-    space, bounds = where
-    check_call(fun, y0, bounds, space)
+    space, bounds, takes_key = where
+    check_call(fun, y0, bounds, space, takes_key)
+    fun, args = keyed(fun, args, key) if takes_key else (fun, args)
     units = UnitSpace.of(y0, space)
     if space is not None:
         fun, y0 = units.wrap(fun), units.unit(y0)
@@ -236,7 +249,7 @@ def _run(
     else:
         check_solver(solver, interface, example, sigma, support)
         solver = solver if isinstance(solver, AbstractSmoothSolver) else Wrapped(solver)
-    options = {"key": key} if bounds is None else {"key": key, "bounds": bounds}
+    options = write_options(key, bounds, takes_key)
     ends = Limits.of(solver, y, *limits)
     with explained():
         if solver.sizes(y) is None:

@@ -60,8 +60,9 @@ class Result:
     Attributes:
         y: the best point. Of a function without noise, always the lowest that was evaluated. With
             noise, found by evaluating that point again, the winner of fresh evaluations of a few
-            candidates, the start among them. If the run was cut short ("interrupted", or an error)
-            the lowest that was evaluated, which with noise may be luck.
+            candidates, the start among them; with `takes_key` what is said there. If the run was
+            cut short ("interrupted", or an error) the lowest that was evaluated, which with noise
+            may be luck.
         fun: the function there; of least squares half the sum of squares. With noise, the mean of
             three fresh evaluations.
         smoothed: the smoothed function there, from a last batch; a point of that batch which is

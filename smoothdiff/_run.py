@@ -23,6 +23,7 @@ from smoothdiff._parameter_errors import Answer
 from smoothdiff._reraise import reraise
 from smoothdiff._result import MinimiseError, Record, Result
 from smoothdiff._solvers import Progress
+from smoothdiff._solvers._random_numbers import takes_key
 from smoothdiff._solvers._wrapped import Wrapped
 from smoothdiff._unit_space import UnitSpace
 
@@ -146,8 +147,10 @@ class Run:
         """Raises ValueError if the function is no longer what it was at the lowest point.
 
         This takes an evaluation; if the value is another one, two more. If these differ again, the
-        function has noise, and nothing is known.
+        function has noise, and nothing is known. Nor is it of one that takes random numbers.
         """
+        if takes_key(self.problem.options):
+            return
         there, before = self.state.progress.lowest_y, self.state.progress.lowest_fun.item()
         now = self._fun(there)
         seen = now, before, *(value for r in self.history for value in (r.fun, r.smoothed))

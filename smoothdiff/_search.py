@@ -7,13 +7,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from smoothdiff._default_solver import default_solver
 from smoothdiff._host_steps import HostSteps
-from smoothdiff._params import layout_of
+from smoothdiff._params import as_key, layout_of
 from smoothdiff._run import inexact
 from smoothdiff._solvers import AbstractSmoothSolver
+from smoothdiff._solvers._base import write_options
 from smoothdiff._solvers._point_search import TRUST
 from smoothdiff._unit_space import UnitSpace
 
@@ -47,6 +48,8 @@ class Search:
         sigma: of the default solver, as for `minimise`.
         space: as for `minimise`.
         bounds: as for `minimise`.
+        takes_key: whether the function draws random numbers, as for `minimise`. `search.key` is the
+            key for the points that are asked for next; numbers of another origin are as good.
 
     Raises:
         TypeError, ValueError: an argument that cannot work.
@@ -73,6 +76,7 @@ class Search:
         sigma: PyTree = None,
         space: PyTree = None,
         bounds: tuple[PyTree, PyTree] | None = None,
+        takes_key: bool = False,
     ):
         self._natural, unit = (lambda y: y), lambda y: y
         if space is not None:
@@ -94,7 +98,8 @@ class Search:
                 f"{type(solver).__name__} is not for this: write residuals={not residuals}"
             )
         self.solver: Any = solver
-        options = {"key": key} | ({} if bounds is None else {"bounds": bounds})
+        options = write_options(key, bounds, takes_key)
+        self._key, self._takes_key = as_key(key), takes_key
         self._steps = HostSteps.of(solver, options, self._y)
         self._layout, self._random = layout_of(self._y), np.random.default_rng(0)
         self._size: int | None = None
@@ -107,18 +112,28 @@ class Search:
 
     @property
     def y(self) -> PyTree:
-        """The lowest point of those that were told."""
-        return self._natural(self._state.progress.lowest_y)
+        """The lowest point of those that were told; with `takes_key` the solver's iterate."""
+        return self._natural(self._y if self._takes_key else self._state.progress.lowest_y)
 
     @property
     def fun(self) -> float:
-        """The value there, or half the sum of squares; infinite before anything was told."""
+        """The lowest value, or half the sum of squares; infinite before anything was told."""
         return self._state.progress.lowest_fun.item()
 
     @property
     def evaluations(self) -> int:
         """How many values were told."""
         return self._state.progress.evaluations.item() + len(self._came)
+
+    @property
+    def key(self) -> Array:
+        """For a function that draws random numbers: those of the points that are asked for next.
+
+        It changes only when values are told, and is the same for evaluations that are compared.
+        """
+        if not self._takes_key:
+            raise ValueError("there is a key for a function that takes one: write takes_key=True")
+        return self._steps.parts(self._y, self._state).numbers((None, self._key))[1]
 
     @property
     def done(self) -> bool:

@@ -14,7 +14,7 @@ import pytest
 import smoothdiff as sd
 from smoothdiff._seen import Seen
 from smoothdiff._solvers._base import Progress
-from smoothdiff._solvers._judgement import judged, judging
+from smoothdiff._solvers._judgement import Values, judged, judging
 
 KEY = jax.random.key(2)
 TARGET = np.array([0.6, -0.4], np.float32)
@@ -205,7 +205,8 @@ def judge(fun, seen, new, old=()):
     estimate = first, jnp.float32(0), jnp.float32(0), 1.0
     progress = progress.after(*estimate, 10, finite, Seen(jnp.asarray(seen[0]), seen[1]))
     batch = lambda y: (fun(y), jnp.float32(0), Seen(y, fun(y)))
-    return judged(progress, jax.vmap(fun), batch, 4, new, old)
+    values = Values(lambda points, number: jax.vmap(fun)(points), takes_key=False)
+    return judged(progress, values, batch, 4, new, old)
 
 
 def test_candidates_that_are_not_finite_lose_and_the_first_of_equals_wins():

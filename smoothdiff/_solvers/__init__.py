@@ -10,6 +10,8 @@ but for rounding. What both rely on:
   come from the key, folded with counters of the state, and from nothing else.
 * The state is an `eqx.Module` of arrays, of the same shapes and dtypes at every step, with a field
   `progress: Progress`. No typed keys, Python numbers or operators are in it.
+* With the option `"takes_key"` args is a pair (args, key), and the function sees another key in
+  each step and in each round of the judgement (`_random_numbers`).
 * `init` evaluates nothing. `sd.minimise` calls it with concrete values: it refuses bad ones.
 * `step` makes at most `evaluations_per_step(y)` evaluations and counts them in its progress. When
   the estimate or the new iterate is not finite, it returns the old iterate and a progress whose

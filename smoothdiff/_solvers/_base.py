@@ -156,11 +156,21 @@ class AbstractSmoothSolver(eqx.Module):
         return "converged"
 
 
+def write_options(
+    key: Any, bounds: tuple[PyTree, PyTree] | None, takes_key: bool
+) -> dict[str, Any]:
+    """The options of a solver, without those that are not used."""
+    options = {"key": key, "bounds": bounds, "takes_key": takes_key or None}
+    return {name: option for name, option in options.items() if option is not None}
+
+
 def read_options(options: dict[str, Any]) -> tuple[Array, tuple[PyTree, PyTree] | None]:
     """The key and the bounds (or None) from the options of a solver."""
-    unknown = set(options) - {"key", "bounds"}
+    unknown = set(options) - {"key", "bounds", "takes_key"}
     if unknown:
-        raise ValueError(f'options has unknown entries {sorted(unknown)}: use "key" and "bounds"')
+        raise ValueError(
+            f'options has unknown entries {sorted(unknown)}: use "key", "bounds" and "takes_key"'
+        )
     if options.get("key") is None:
         raise ValueError(
             "the solver draws random samples and needs a key: pass "

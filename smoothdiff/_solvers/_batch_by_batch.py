@@ -22,9 +22,10 @@ from smoothdiff._solvers._base import (
 from smoothdiff._solvers._batch_search import BatchSearch
 from smoothdiff._solvers._evaluator import Evaluator, half_squares
 from smoothdiff._solvers._history import History
-from smoothdiff._solvers._judgement import judged, judging
+from smoothdiff._solvers._judgement import by_rows, judged, judging
 from smoothdiff._solvers._local_steps import TRIED, steps_to_try
 from smoothdiff._solvers._parameter_regression import gauss_newton_step
+from smoothdiff._solvers._random_numbers import in_step
 from smoothdiff._solvers._residual_batch import (
     ResidualBatch,
     around,
@@ -130,7 +131,8 @@ def step(
     """One batch, one regression, one step."""
     progress, search = state.progress, state.search
     params = smoothed_params(solver, y, progress.step, options)
-    residuals = Evaluator(fn, args, params.layout, True, solver.batch_size)
+    numbers = in_step(args, options, progress.step)
+    residuals = Evaluator(fn, numbers, params.layout, True, solver.batch_size)
     key = jax.random.fold_in(read_options(options)[0], progress.step)
     count, _, tried = sizes_of(solver, y)
     sigma = params.sigma * search.scale
@@ -196,11 +198,12 @@ def judge(
     def estimate(y):
         params = smoothed_params(solver, y, progress.step, options)
         points = _points(solver, params, key, params.sigma * scale, count)
-        residuals = Evaluator(fn, args, params.layout, True, solver.batch_size)
+        numbers = in_step(args, options, progress.step)
+        residuals = Evaluator(fn, numbers, params.layout, True, solver.batch_size)
         return fresh_loss(residuals, points, solver.nonfinite)
 
     params = smoothed_params(solver, y, progress.step, options)
-    values = Evaluator(fn, args, params.layout, True, solver.batch_size).values
+    values = by_rows(Evaluator(fn, args, params.layout, True, solver.batch_size), options)
     # every iterate but the last was evaluated
     old = progress.start_y, progress.best_y
     return judged(progress, values, estimate, count, [y], old)

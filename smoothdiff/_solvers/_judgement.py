@@ -1,24 +1,37 @@
 """The last judgement: of all that a run has seen, what it returns."""
 
+import dataclasses
+import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from smoothdiff._seen import Seen
 from smoothdiff._solvers._base import Progress
+from smoothdiff._solvers._evaluator import Evaluator
+from smoothdiff._solvers._random_numbers import in_round, takes_key
 
 # how often each candidate is evaluated where the function is noisy
 _REPEATS = 3
+# so many standard errors lower is clearly lower
+_CLEARLY = 3.0
 # what rounding may do to a value that another program computes again, in units of its own
 _ROUNDING = 64
 
 
+class Values(NamedTuple):
+    """The function `at` stacked points, with the numbers of a round if it takes a key."""
+
+    at: Callable[[PyTree[Array], Int[Array, ""]], Float[Array, " m"]]
+    takes_key: bool
+
+
 def judged(
     progress: Progress,
-    values: Callable[[PyTree[Array]], Float[Array, " m"]],
+    values: Values,
     estimate: Callable[[PyTree[Array]], tuple[Array, Array, Seen]],
     batch: int,
     new: Sequence[PyTree[Array]],
@@ -32,12 +45,16 @@ def judged(
     If not, its value was luck: then all candidates, the `old` ones too, are evaluated until there
     are three values of each, and the lowest mean is the answer.
 
+    A function that takes a key is evaluated at all candidates in three rounds, each with fresh
+    numbers that all of them share. The first of the `new` ones is the answer, unless another one is
+    clearly lower.
+
     A last batch around the answer gives the smoothed function there. Without noise, a point of that
     batch which is lower still takes the answer's place.
 
     Args:
         progress: Of the run.
-        values: The function itself, at stacked points.
+        values: The function itself.
         estimate: y -> the smoothed function, its standard error, the lowest of the fresh batch
             behind them.
         batch: The evaluations that `estimate` makes.
@@ -51,6 +68,8 @@ def judged(
         finite loses; of equals the first of the `new` ones wins, as on a plateau an iterate is
         further from the edges than a sample.
     """
+    if values.takes_key:
+        new, old = [*new, *old], []
     candidates = *new, progress.lowest_y, *old
     points = jax.tree.map(lambda *leaves: jnp.stack(leaves), *candidates)
     count, each = len(candidates), 1 + len(new)
@@ -59,24 +78,25 @@ def judged(
 
     def more(state: tuple[Array, Array]) -> Bool[Array, ""]:
         done, found = state
-        return (done == 0) | ((done < rounds) & differ(found[each - 1], progress.lowest_fun))
+        again = values.takes_key | differ(found[each - 1], progress.lowest_fun)
+        return (done == 0) | ((done < rounds) & again)
 
     # one loop, so that the function is compiled once, and every value of a point by one program
     def evaluated(state: tuple[Array, Array]) -> tuple[Array, Array]:
         done, found = state
         at = (each * done + jnp.arange(each, dtype=jnp.int32)) % count
-        fresh = values(jax.tree.map(lambda a: a[at], points)).astype(dtype)
+        fresh = values.at(jax.tree.map(lambda a: a[at], points), done).astype(dtype)
         return done + 1, jax.lax.dynamic_update_slice(found, fresh, (each * done,))
 
     none = jnp.asarray(0, jnp.int32), jnp.full(rounds * each, jnp.nan, dtype)
     done: Array
     found: Array
     done, found = loop(more, evaluated, none)
-    y, fun, noisy = _winner(found, points)
+    y, fun, differs = (_clear_winner if values.takes_key else _winner)(found, points)
 
     smoothed, stderr, seen = estimate(y)
     last = seen.value.astype(dtype)
-    lower = ~noisy & (last < fun)
+    lower = ~differs & (last < fun)
     y, fun = jax.tree.map(lambda a, b: jnp.where(lower, a, b), (seen.point, last), (y, fun))
     evaluations = progress.evaluations + each * done + batch
     return y, {"fun": fun, "smoothed": smoothed, "stderr": stderr, "evaluations": evaluations}
@@ -97,21 +117,48 @@ def _winner(found: Float[Array, " m"], points: PyTree[Array]) -> tuple[PyTree[Ar
     return jax.tree.map(lambda a: a[winner], points), means[winner], jnp.any(above > 0)
 
 
+@jax.jit
+def _clear_winner(
+    found: Float[Array, " m"], points: PyTree[Array]
+) -> tuple[PyTree[Array], Array, Array]:
+    """The first point, unless by the same random numbers another one is clearly lower.
+
+    Also its mean, and whether it differs from round to round.
+    """
+    table = found.reshape(_REPEATS, -1)
+    finite = jnp.all(jnp.isfinite(table), axis=0)
+    away = jnp.where(finite[None], table - table[:, :1], 0)
+    error = jnp.std(away, axis=0, ddof=1) / math.sqrt(_REPEATS)
+    lower = finite & (~finite[0] | (jnp.mean(away, axis=0) < -_CLEARLY * error))
+    means = jnp.mean(table, axis=0)
+    winner = jnp.where(jnp.any(lower), jnp.argmin(jnp.where(lower, means, jnp.inf)), 0)
+    differs = jnp.any(table[:, winner] != table[0, winner])
+    return jax.tree.map(lambda a: a[winner], points), means[winner], differs
+
+
 def judging(batch: int, new: int, old: int = 0) -> int:
     """The most evaluations that `judged` makes for so many candidates."""
     return _rounds(1 + new + old, 1 + new) * (1 + new) + batch
 
 
-def one_by_one(
-    fn: Callable, args: Any, batch_size: int | None
-) -> Callable[[PyTree[Array]], Float[Array, " m"]]:
+def one_by_one(fn: Callable, args: Any, options: dict[str, Any], batch_size: int | None) -> Values:
     """The function at stacked points, at most so many of them at a time."""
 
-    def values(points: PyTree[Array]) -> Array:
-        size = batch_size or len(jax.tree.leaves(points)[0])
-        return jax.lax.map(lambda y: fn(y, args)[0], points, batch_size=size)
+    def at(points: PyTree[Array], number: Int[Array, ""]) -> Array:
+        size, seen = batch_size or len(jax.tree.leaves(points)[0]), in_round(args, options, number)
+        return jax.lax.map(lambda y: fn(y, seen)[0], points, batch_size=size)
 
-    return values
+    return Values(at, takes_key(options))
+
+
+def by_rows(evaluate: Evaluator, options: dict[str, Any]) -> Values:
+    """The same where the function returns rows."""
+
+    def at(points: PyTree[Array], number: Int[Array, ""]) -> Array:
+        args = in_round(evaluate.args, options, number)
+        return dataclasses.replace(evaluate, args=args).values(points)
+
+    return Values(at, takes_key(options))
 
 
 def _rounds(count: int, each: int) -> int:

@@ -25,6 +25,7 @@ from smoothdiff._solvers._base import (
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import judged, judging, one_by_one
 from smoothdiff._solvers._metric import Metric
+from smoothdiff._solvers._random_numbers import in_step
 from smoothdiff._solvers._regression_step import Center
 from smoothdiff._solvers._restarts import Restarts
 from smoothdiff._stderr import value_stderr
@@ -72,6 +73,7 @@ def _metric(solver: Any, metric: Metric, params: Params) -> Metric:
 def _batch(solver, fn, y, args, params: Params, center: Center, step, options) -> Batch:
     """One batch around y; its points are in units of the width."""
     unit = take_apart(jnp.zeros_like(params.theta), 1.0, None)
+    args = in_step(args, options, step)
 
     def fun(u: Array, _: list) -> tuple[Array, PyTree]:
         return watched(fn, args)(params.layout.tree(center.sample(params, u)))
@@ -178,5 +180,5 @@ def judge(
     params = smoothed_params(solver, y, progress.step, options)
     accepted = params.layout.tree(center.accepted)
     new = y, accepted, progress.best_y, progress.start_y
-    values = one_by_one(fn, args, None)
+    values = one_by_one(fn, args, options, None)
     return judged(progress, values, estimate, evaluations_per_step(solver, y), new)

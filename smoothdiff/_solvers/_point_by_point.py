@@ -24,8 +24,9 @@ from smoothdiff._solvers._base import (
 )
 from smoothdiff._solvers._evaluator import Evaluator, objectives
 from smoothdiff._solvers._history import History
-from smoothdiff._solvers._judgement import judged, judging
+from smoothdiff._solvers._judgement import Values, judged, judging
 from smoothdiff._solvers._point_search import AbstractPointSearch, Sizes
+from smoothdiff._solvers._random_numbers import in_step, takes_key
 
 # by default a search ends after so many evaluations for each parameter, and one, without a lower
 # point
@@ -57,9 +58,24 @@ def final_evaluations(candidates: int) -> int:
 
 
 def init(
-    solver: Any, y: PyTree[Array], search: AbstractPointSearch, aux_struct: PyTree
+    solver: Any,
+    y: PyTree[Array],
+    search: AbstractPointSearch,
+    options: dict[str, Any],
+    aux_struct: PyTree,
 ) -> PointState:
-    """The state before a search that has evaluated nothing."""
+    """The state before a search that has evaluated nothing.
+
+    Raises:
+        ValueError: other searches are to follow, of a function that takes random numbers.
+    """
+    if takes_key(options):
+        if solver.restarts:
+            raise ValueError(
+                f"restarts={solver.restarts} do not go with takes_key=True, as no search of such a "
+                "function ends: call minimise from several starts instead"
+            )
+        search = search.averaging()
     if solver.sampler is not None:
         draw = lambda key: _normal_points(solver, key, 1, search.start)
         jax.eval_shape(draw, jax.random.key(0))
@@ -83,6 +99,10 @@ class PointStep(eqx.Module):
     def params(self) -> Params:
         """The parameters with the solver's sigma."""
         return smoothed_params(self.solver, self.y, self.state.progress.step, self.options)
+
+    def numbers(self, args: PyTree) -> PyTree:
+        """The arguments of the function in this step."""
+        return in_step(args, self.options, self.state.search.numbers())
 
     def propose(self, stage: int | None = None) -> tuple[Float[Array, "K n"], Any]:
         """The points that come next, within the bounds, and what the model says of them."""
@@ -120,8 +140,10 @@ class PointStep(eqx.Module):
             small = moved < jnp.maximum(solver.atol + solver.rtol * scale, rounding)
             small &= (solver.rtol > 0) | (solver.atol > 0)
             small &= after.settled() & ~after.plateau(_PLATEAU * rounding)
+            small &= after.average is None
         point, fun = lowest(points, jnp.where(good, funs, jnp.inf))
         least = (jnp.minimum(fun, progress.lowest_fun) == 0) & solver.squares
+        least &= after.average is None
         after = after.counted(small, fun < progress.lowest_fun, least, sizes.step)
         # the end of a step that is tried may be anything, and so may a place that nobody asked for
         later = state.restarts < solver.restarts
@@ -192,7 +214,7 @@ class PointStep(eqx.Module):
 
     def judge(
         self,
-        values: Callable[[PyTree[Array]], Float[Array, " m"]],
+        values: Values,
         loop: Callable = jax.lax.while_loop,
     ) -> tuple[PyTree[Array], dict[str, Array]]:
         """The best point of those seen and of what the models say, by its `values`.
@@ -207,7 +229,9 @@ class PointStep(eqx.Module):
             return smoothed, unknown, Seen(y, jnp.full_like(unknown, jnp.inf))
 
         new = [params.layout.tree(params.clip(theta)) for theta in search.candidates()]
-        return judged(progress, values, estimate, 0, new, [progress.start_y], loop)
+        # with a key, the lowest of all is no higher than the start by the same numbers
+        old = [] if values.takes_key else [progress.start_y]
+        return judged(progress, values, estimate, 0, new, old, loop)
 
 
 def _samples(solver: Any, key: Array, search: AbstractPointSearch, count: int) -> Array:

@@ -1,6 +1,7 @@
 """What searches have in common that evaluate a function point by point."""
 
 import abc
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
+from smoothdiff._solvers._averaging import Average
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._pilot import PAIRS, Pilot
 
@@ -41,7 +43,7 @@ class AbstractPointSearch(eqx.Module):
     away as it found something else.
 
     `evaluated` counts the evaluations, `small` the small steps in a row, `stale` the evaluations
-    since the last lower point.
+    since the last lower point. There is an `average` if the function takes random numbers.
     """
 
     stage: Int[Array, ""]
@@ -51,6 +53,7 @@ class AbstractPointSearch(eqx.Module):
     small: Int[Array, ""]
     stale: Int[Array, ""]
     pilot: Pilot
+    average: Average | None
 
     @abc.abstractmethod
     def widened(
@@ -108,9 +111,16 @@ class AbstractPointSearch(eqx.Module):
     def settled(self) -> Bool[Array, ""]:
         """Whether a short step is a sign of convergence."""
 
-    @abc.abstractmethod
     def over(self, sizes: Sizes) -> Bool[Array, ""]:
-        """Whether the search leads nowhere any more, so that another may follow."""
+        """Whether the search leads nowhere any more, so that another may follow.
+
+        A mean is never so near that further rounds do not bring it nearer.
+        """
+        return jnp.asarray(False) if self.average is not None else self.lost(sizes)
+
+    @abc.abstractmethod
+    def lost(self, sizes: Sizes) -> Bool[Array, ""]:
+        """Whether it leads nowhere any more where there is no mean."""
 
     @abc.abstractmethod
     def smoothing(self) -> Float[Array, ""]:
@@ -118,11 +128,26 @@ class AbstractPointSearch(eqx.Module):
 
     def candidates(self) -> list[Float[Array, " n"]]:
         """What may be better than the lowest point, but was not evaluated."""
-        return []
+        return [] if self.average is None else [self.iterate()]
 
     @abc.abstractmethod
     def round(self) -> Int[Array, ""]:
         """Counts the rounds of samples, so that each has random numbers of its own."""
+
+    def numbers(self) -> Int[Array, ""]:
+        """Counts the keys of a function that takes one.
+
+        The local model has a key, in which its values are compared, and each round of samples.
+        """
+        return self.round()
+
+    def averaging(self) -> Any:
+        """The same search, of a function that takes random numbers."""
+        return dataclasses.replace(self, average=Average.start(self.start))
+
+    def with_mean(self, average: Average) -> Any:
+        """With another center in the mean."""
+        return dataclasses.replace(self, average=average)
 
     def counted(self, small: Array, lower: Array, least: Array, count: int) -> Any:
         """With a small step more or less, and so many evaluations; `least` is as low as can be."""
@@ -134,7 +159,8 @@ class AbstractPointSearch(eqx.Module):
     def kept(self, new: History) -> Any:
         """With these evaluations in the history instead of the oldest."""
         count = len(new.funs)
-        room = self.history.keeping_best(count)
+        # what is lowest by luck stays no longer than others
+        room = self.history.keeping_best(count) if self.average is None else self.history
         history = room.after(new.points, new.rows, new.funs, new.valid, jnp.asarray(count))
         return eqx.tree_at(lambda s: s.history, self, history)
 
@@ -189,8 +215,9 @@ class AbstractPointSearch(eqx.Module):
         return self.is_local() | (self.stage == PILOT)
 
     def iterate(self) -> Float[Array, " n"]:
-        """The best point."""
-        return self.history.best(self.start)[0]
+        """The best point; of a function that takes random numbers the mean, once there is one."""
+        best, *_ = self.history.best(self.start)
+        return best if self.average is None else self.average.over(best)
 
 
 def where(condition: Bool[Array, ""], a: Any, b: Any) -> Any:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from smoothdiff._params import Params
+from smoothdiff._solvers._averaging import apart
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._noisy_step import Trust, outcome, propose, revise
 from smoothdiff._solvers._point_search import Sizes, nothing
@@ -62,11 +63,13 @@ class Center(eqx.Module):
         adaptive: bool,
         returns: Bool[Array, ""],
         small: Callable[[Array], Array] = lambda move: jnp.asarray(False),
+        takes_key: bool = False,
     ) -> tuple["Center", Float[Array, ""], Float[Array, ""]]:
         """The next center; the smoothed function at this one, and its standard error.
 
         It `returns` to the lowest sample from a step that led nowhere, or not.
-        `small` says whether a step is too small to lead anywhere.
+        `small` says whether a step is too small to lead anywhere. Where the function
+        `takes_key`, samples are no nearer to each other than noise allows.
         """
         theta, metric, trust = self.theta, self.metric, self.trust
         model = fit(metric.into(points - theta[None]) / trust.width, values, valid)
@@ -96,6 +99,10 @@ class Center(eqx.Module):
         # an estimate below all samples is an error of the model
         value = jnp.maximum(model.value(here), known[lowest])
         new = revise(trust, step, good, ratio, value, small(x - base), adaptive)
+        if takes_key:
+            wide = jnp.maximum(new.width, apart(trust.width, model.noise, model.spread(here)))
+            radius = new.radius * new.width / wide
+            new = eqx.tree_at(lambda t: (t.width, t.radius), new, (wide, radius))
         back = (new.stall >= _LOST) & (new.stall % 2 == 0) & returns
         x, base = (jnp.where(back, points[lowest], a) for a in (x, base))
         narrower = _NARROWER * trust.width, jnp.zeros_like(new.reduction)

@@ -63,6 +63,7 @@ class ResidualSearch(AbstractPointSearch):
             small=none,
             stale=none,
             pilot=Pilot.start(theta),
+            average=None,
         )
 
     def again(
@@ -90,13 +91,17 @@ class ResidualSearch(AbstractPointSearch):
         """The local model's may be none."""
         return ~self.is_local() | self.trust.settled
 
-    def over(self, sizes: Sizes) -> Bool[Array, ""]:
+    def lost(self, sizes: Sizes) -> Bool[Array, ""]:
         """Whether it converged, or so many evaluations in a row were no lower."""
         return self.converged() | (self.stale >= sizes.patience)
 
     def round(self) -> Int[Array, ""]:
         """So many wide rounds."""
         return self.wide.rounds
+
+    def numbers(self) -> Int[Array, ""]:
+        """In rounds each sample has a key of its own, as its residuals are not compared."""
+        return jnp.where(self.stage == WIDE, self.evaluated, 0)
 
     def smoothing(self) -> Float[Array, ""]:
         """Half the squares of what the linear model adds."""
@@ -239,10 +244,12 @@ class ResidualSearch(AbstractPointSearch):
             wide,
             (true, before, row, taken, idle, found),
         )
-        moved = lambda: wide.stepped(self.history, params, wanted)
-        search = eqx.tree_at(
-            lambda s: s.wide, self, jax.lax.cond(taken >= wanted, moved, lambda: wide)
-        )
+        average, full = self.average, taken >= wanted
+        moved = lambda: wide.stepped(self.history, params, wanted, takes_key=average is not None)
+        wide = jax.lax.cond(full, moved, lambda: wide)
+        search = eqx.tree_at(lambda s: s.wide, self, wide)
+        if average is not None:
+            return search.with_mean(where(full, average.after(wide.center), average))
         came_true = true >= _TRUE
         # the local model begins anew around what was found, or goes on
         radius = jnp.where(

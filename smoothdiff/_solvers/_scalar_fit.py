@@ -32,7 +32,10 @@ _HIGH, _FAINT = 3.0, 1e-3
 
 
 class ScalarFit(eqx.Module):
-    """A fit to samples; its methods take the place `at`, a displacement in units of the width."""
+    """A fit to samples; its methods take the place `at`, a displacement in units of the width.
+
+    `noise` is the standard deviation of what it leaves of a sample.
+    """
 
     points: Float[Array, "m n"]
     coefficients: Float[Array, " m"]
@@ -42,6 +45,7 @@ class ScalarFit(eqx.Module):
     amplitude: Float[Array, ""]
     closeness: Float[Array, " m"]
     factor: Float[Array, "m m"]
+    noise: Float[Array, ""]
 
     def _products(self, at: Array) -> Array:
         return dot(self.points, at) / at.size
@@ -89,6 +93,11 @@ class ScalarFit(eqx.Module):
         bends, radials, away = self._bends(at)
         curved = dot(bends, self.points**2)
         return curved + dot(radials / (at.size + 1), away**2) - jnp.sum(radials)[None]
+
+    def spread(self, at: Float[Array, " n"]) -> Float[Array, ""]:
+        """The standard deviation over standard normal points, by slopes and own curvatures."""
+        squares = jnp.sum(self.grad(at) ** 2) + jnp.sum(self.curvature_diagonal(at) ** 2) / 2
+        return jnp.sqrt(squares)
 
     # Standard errors: what the prior leaves open of a quantity, less what the samples tell of it.
 
@@ -220,4 +229,5 @@ def fit(
         amplitude=scale * jnp.sqrt(misfit),
         closeness=closeness,
         factor=factor,
+        noise=scale * jnp.sqrt(misfit * choice[2]),
     )

@@ -83,6 +83,7 @@ class ValueSearch(AbstractPointSearch):
             small=none,
             stale=none,
             pilot=Pilot.start(theta),
+            average=None,
             steps=width * sigma,
             scan=Scan.start(theta, never, sigma) if bounded(params) else None,
             searches=none,
@@ -132,15 +133,15 @@ class ValueSearch(AbstractPointSearch):
 
     def _anew(self, params: Params, theta: Array, sigma: Array, width: Array) -> "ValueSearch":
         """The same search from another point, with all that was evaluated."""
-        kept = {n: getattr(self, n) for n in ("pilot", "searches", "rounds", "noisy", "scan")}
+        names = "pilot", "average", "searches", "rounds", "noisy", "scan"
         anew = ValueSearch.of(params, theta, sigma, width, self.history)
-        return dataclasses.replace(anew, **kept)
+        return dataclasses.replace(anew, **{name: getattr(self, name) for name in names})
 
     def settled(self) -> Bool[Array, ""]:
         """The local model's may be none."""
         return ~self.is_local() | self.trust.settled
 
-    def over(self, sizes: Sizes) -> Bool[Array, ""]:
+    def lost(self, sizes: Sizes) -> Bool[Array, ""]:
         """Whether neither model leads anywhere; after one converged the wide one may yet."""
         lost = self.center.lost(sizes) & (self.trust.failed() | self._later())
         return lost if self.scan is None else lost | self.scan.failed
@@ -152,7 +153,7 @@ class ValueSearch(AbstractPointSearch):
     def _later(self) -> Bool[Array, ""]:
         """Whether there are wide samples alone."""
         scanned = jnp.asarray(False) if self.scan is None else self.scan.done()
-        return (self.searches > 0) & ~scanned
+        return ((self.searches if self.average is None else self.rounds) > 0) & ~scanned
 
     def width(self) -> Float[Array, ""]:
         """The radius, or the width of the samples."""
@@ -160,7 +161,7 @@ class ValueSearch(AbstractPointSearch):
 
     def candidates(self) -> list[Float[Array, " n"]]:
         """With noise, the lowest point owes much to luck, and the center little."""
-        return [self.center.theta]
+        return [self.center.theta] if self.average is None else super().candidates()
 
     def round(self) -> Int[Array, ""]:
         """So many rounds of samples."""
@@ -262,16 +263,16 @@ class ValueSearch(AbstractPointSearch):
 
     def _stepped(self, params: Params) -> "ValueSearch":
         """The next center, from all samples."""
-        history, returns = self.history, ~self._patient(self.searches) & ~self.noisy
-        center, *_ = self.center.stepped(
-            params, history.points, history.funs, history.valid, True, returns
-        )
+        history, average = self.history, self.average
+        keyed, known = average is not None, (history.points, history.funs, history.valid)
+        returns = ~self._patient(self.searches) & ~self.noisy & (not keyed)
+        center, *_ = self.center.stepped(params, *known, True, returns, takes_key=keyed)
         # a metric can overflow where the function is flat
         finite = all_finite((center.theta, center.metric, center.trust.width))
         center = where(finite, center, self.center)
-        none = jnp.zeros_like(self.taken)
-        new = center, none, self.rounds + 1
-        return eqx.tree_at(lambda s: (s.center, s.taken, s.rounds), self, new)
+        new = center, jnp.zeros_like(self.taken), self.rounds + 1
+        after = eqx.tree_at(lambda s: (s.center, s.taken, s.rounds), self, new)
+        return after if average is None else after.with_mean(average.after(center.theta))
 
     def _turned(self, sizes: Sizes) -> "ValueSearch":
         """The other model's turn, if this one's is over."""
@@ -279,8 +280,9 @@ class ValueSearch(AbstractPointSearch):
         point, _, fun = self.history.best(self.start)
         lower, little = turn.lowered(fun)
         stuck = local & self.trust.stuck()
-        ended = turn.over() | stuck | (~local & self.center.lost(sizes))
-        ended &= ~self._later()
+        # values with other keys are not to be compared, nor is how fast they fell
+        compared = turn.over() & (self.average is None)
+        ended = (compared | stuck | (~local & self.center.lost(sizes))) & ~self._later()
 
         # what one has found the other begins with, unless it found little
         revive = ~local & lower & self.trust.stuck()
@@ -293,7 +295,6 @@ class ValueSearch(AbstractPointSearch):
         ours, theirs = where(local, *done), where(local, *done[::-1])
         after, other = turn.next(fun, len(self.start), (ours, theirs), stuck)
         stage = jnp.where(local == other, WIDE, TRUST).astype(self.stage.dtype)
-        turned = eqx.tree_at(
-            lambda s: (s.stage, s.trust, s.center, s.turn), self, (stage, trust, center, after)
-        )
+        new = stage, trust, center, after
+        turned = eqx.tree_at(lambda s: (s.stage, s.trust, s.center, s.turn), self, new)
         return where(ended, turned, self)

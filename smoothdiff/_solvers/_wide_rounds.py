@@ -5,8 +5,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
+from smoothdiff._solvers._averaging import apart
+from smoothdiff._solvers._base import dot
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._parameter_regression import gauss_newton_step
+from smoothdiff._solvers._residual_batch import centred
 
 # sigma follows twice the standard error of the step, at most so much smaller or larger at a time
 _SHRINK, _GROW = 0.25, 1.5
@@ -48,10 +51,17 @@ class Wide(eqx.Module):
         no = jnp.asarray(False)
         return Wide(center, row, still, scale, before, none, none, none, none, no, no)
 
-    def stepped(self, history: History, params: Params, count: Array) -> "Wide":
-        """The regression over the round and what was before it; the next round."""
+    def stepped(
+        self, history: History, params: Params, count: Array, takes_key: bool = False
+    ) -> "Wide":
+        """The regression over the round and what was before it; the next round.
+
+        Where the function `takes_key`, samples are no nearer to each other than noise allows.
+        """
         sigma = params.sigma * self.scale
-        center, here = history.lowest(self.center, self.row)
+        # what is lowest by luck is no better
+        here = self.center, self.row
+        center, here = here if takes_key else history.lowest(*here)
         u = (history.points - center[None]) / sigma[None]
         sides = sides_of(params, center, sigma)
         move, error = gauss_newton_step(u, history.rows, history.valid, *sides)
@@ -64,6 +74,9 @@ class Wide(eqx.Module):
         # a few that are the same call for more of them first
         flat = same & ~self.seen
         scale = next_scale(self.scale, flat, history, here, u, error, longest / LONGEST)
+        if takes_key:
+            least = apart(self.scale, *_noise_and_signal(u, history.rows, history.valid))
+            scale = jnp.where(flat, scale, jnp.maximum(scale, least))
         # where most samples gave no numbers they were too far away
         few = 2 * jnp.sum(fresh) < count
         scale = jnp.where(few, self.scale / 2, scale)
@@ -126,3 +139,25 @@ def next_scale(
     wanted = jnp.maximum(2 * jnp.sqrt(jnp.mean(error**2)), length)
     wanted = jnp.clip(jnp.maximum(wanted, extent), _SHRINK, _GROW)
     return jnp.where(flat, 2 * scale, jnp.minimum(wanted * scale, _WIDEST))
+
+
+def _noise_and_signal(
+    u: Float[Array, "M n"], rows: Float[Array, "M P"], valid: Bool[Array, " M"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The roots of the variance of rows that a linear fit leaves, and of that which it explains.
+
+    Both are sums over the row; the second is that over standard normal points u.
+    """
+    count = jnp.sum(valid).astype(u.dtype)
+    u, rows = centred(u, valid), centred(rows, valid)
+    left: Array
+    values: Array
+    left, values, _ = jnp.linalg.svd(u, full_matrices=False)
+    known = values > len(u) * jnp.finfo(u.dtype).eps * values[0]
+    inverse = jnp.where(known, 1 / jnp.where(known, values, 1), 0)
+    along = dot(left.T, rows)
+    freedom = jnp.maximum(count - u.shape[1] - 1, 1)
+    noise = jnp.maximum(jnp.sum(rows**2) - jnp.sum(along**2), 0) / freedom
+    # noise makes slopes seem longer than they are
+    signal = jnp.sum((inverse[:, None] * along) ** 2) - noise * jnp.sum(inverse**2)
+    return jnp.sqrt(noise), jnp.sqrt(jnp.maximum(signal, 0))

@@ -13,7 +13,7 @@ from smoothdiff._params import layout_of
 from smoothdiff._seen import Seen
 from smoothdiff._solvers._base import AbstractSmoothSolver, Progress
 from smoothdiff._solvers._evaluator import Evaluator
-from smoothdiff._solvers._judgement import judged, judging
+from smoothdiff._solvers._judgement import by_rows, judged, judging
 
 _STATS = {"fun", "smoothed", "stderr", "evaluations"}
 
@@ -80,7 +80,7 @@ class Wrapped(AbstractSmoothSolver):
             unknown = jnp.full_like(progress.lowest_fun, jnp.nan)
             estimate = lambda y: (unknown, unknown, Seen(y, jnp.full_like(unknown, jnp.inf)))
             squares = isinstance(self.solver, optx.AbstractLeastSquaresSolver)
-            values = Evaluator(fn, args, layout_of(y), squares, None).values
+            values = by_rows(Evaluator(fn, args, layout_of(y), squares, None), options)
             y, stats = judged(progress, values, estimate, 0, [y], [progress.start_y])
         return y, aux, {name: stats[name] for name in _STATS}
 

@@ -30,6 +30,7 @@ from smoothdiff._solvers._base import (
     unless_failed,
 )
 from smoothdiff._solvers._judgement import judged, judging, one_by_one
+from smoothdiff._solvers._random_numbers import in_step
 
 # so many small updates in a row count as convergence: under noise a single one is luck
 _PATIENCE = 5
@@ -157,6 +158,7 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
     def step(self, fn, y, args, options, state: FirstOrderState, tags):
         """One batch, one update."""
         progress = state.progress
+        args = in_step(args, options, progress.step)
         estimate = self._estimator(fn, args, progress.step, options)
         (fun, (stderr, seen)), grad = jax.value_and_grad(estimate, has_aux=True)(y)
         optim = optax.with_extra_args_support(self.optim)
@@ -187,15 +189,17 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         """Judges all that was seen, the start, the last iterate, the average, the best estimate."""
         progress = state.progress
-        estimate = self._estimator(fn, args, progress.step, options)
+        numbers = in_step(args, options, progress.step)
+        estimate = self._estimator(fn, numbers, progress.step, options)
 
         def smoothed(y):
             fun, (stderr, seen) = estimate(y)
             return fun, stderr, seen
 
-        values = one_by_one(fn, args, self.batch_size)
+        values = one_by_one(fn, args, options, self.batch_size)
         # the mean of points at a bound may be beyond it, by rounding
         average = project(state.average, read_options(options)[1])
-        new = y, average, progress.best_y, progress.start_y
+        last = (average, y) if values.takes_key else (y, average)
+        new = *last, progress.best_y, progress.start_y
         y, stats = judged(progress, values, smoothed, self.num_samples, new)
         return y, aux, stats

@@ -16,6 +16,7 @@ from smoothdiff._solvers import _batch_by_batch, _point_by_point
 from smoothdiff._solvers._base import AbstractSmoothSolver, check_settings, smoothed_params, stopped
 from smoothdiff._solvers._evaluator import Evaluator
 from smoothdiff._solvers._history import History
+from smoothdiff._solvers._judgement import by_rows
 from smoothdiff._solvers._point_search import Sizes
 from smoothdiff._solvers._residual_batch import check_residuals
 from smoothdiff._solvers._residual_search import ResidualSearch
@@ -185,7 +186,7 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         usual = max(min(max(12 * n, 32), 256), 3 * sizes.first, 2 * n)
         length = max(self.history or usual, sizes.first, n + 2)
         search = ResidualSearch.of(theta, History.empty(length, n, size, theta.dtype))
-        return _point_by_point.init(self, y, search, aux_struct)
+        return _point_by_point.init(self, y, search, options, aux_struct)
 
     def step(self, fn, y, args, options, state, tags):
         """The next evaluations."""
@@ -193,7 +194,7 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         if sizes is None:
             return _batch_by_batch.step(self, fn, y, args, options, state)
         parts = _point_by_point.PointStep(self, sizes, y, options, state)
-        return parts.step(Evaluator(fn, args, layout_of(y), True, self.batch_size))
+        return parts.step(Evaluator(fn, parts.numbers(args), layout_of(y), True, self.batch_size))
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """Where the last search leads nowhere any more, or after a failed step."""
@@ -214,6 +215,7 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             y, stats = _batch_by_batch.judge(self, fn, y, args, options, state)
         else:
             parts = _point_by_point.PointStep(self, sizes, y, options, state)
-            y, stats = parts.judge(Evaluator(fn, args, layout_of(y), True, self.batch_size).values)
+            evaluate = Evaluator(fn, args, layout_of(y), True, self.batch_size)
+            y, stats = parts.judge(by_rows(evaluate, options))
             aux = state.aux
         return y, aux, stats

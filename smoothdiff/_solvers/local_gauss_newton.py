@@ -25,13 +25,14 @@ from smoothdiff._solvers._base import (
     unless_failed,
 )
 from smoothdiff._solvers._evaluator import Evaluator
-from smoothdiff._solvers._judgement import judged, judging
+from smoothdiff._solvers._judgement import by_rows, judged, judging
 from smoothdiff._solvers._local_ensemble import (
     DAMPINGS,
     Blame,
     best_of_each_place,
     ensemble_steps,
 )
+from smoothdiff._solvers._random_numbers import in_step
 from smoothdiff._solvers._residual_batch import (
     ResidualBatch,
     around,
@@ -194,7 +195,8 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         """One batch, one step in each place, the best of nine ends."""
         progress = state.progress
         params = smoothed_params(self, y, progress.step, options)
-        residuals = Evaluator(fn, args, params.layout, True, self.batch_size)
+        numbers = in_step(args, options, progress.step)
+        residuals = Evaluator(fn, numbers, params.layout, True, self.batch_size)
         blame = Blame.of(self._blamed(), params.layout.tree, params.theta)
         key = jax.random.fold_in(read_options(options)[0], progress.step)
         sigma = params.sigma * state.scale
@@ -238,13 +240,16 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             params = smoothed_params(self, y, progress.step, options)
             sigma = params.sigma * state.scale
             points = around(params, self.sampler, key, sigma, self._samples(y))
-            residuals = Evaluator(fn, args, params.layout, True, self.batch_size)
+            numbers = in_step(args, options, progress.step)
+            residuals = Evaluator(fn, numbers, params.layout, True, self.batch_size)
             return fresh_loss(residuals, points, self.nonfinite)
 
         params = smoothed_params(self, y, progress.step, options)
-        values = Evaluator(fn, args, params.layout, True, self.batch_size).values
+        values = by_rows(Evaluator(fn, args, params.layout, True, self.batch_size), options)
         # every iterate but the start is an end that was evaluated
         new, old = [progress.start_y], (y, progress.best_y)
+        if values.takes_key:
+            new, old = [y, *new], [progress.best_y]
         y, stats = judged(progress, values, estimate, self._samples(y), new, old)
         return y, aux, stats
 

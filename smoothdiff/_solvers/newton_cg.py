@@ -16,6 +16,7 @@ from smoothdiff._solvers import _newton_batches, _point_by_point
 from smoothdiff._solvers._base import AbstractSmoothSolver, check_settings, smoothed_params, stopped
 from smoothdiff._solvers._evaluator import Evaluator
 from smoothdiff._solvers._history import History
+from smoothdiff._solvers._judgement import by_rows
 from smoothdiff._solvers._point_search import Sizes
 from smoothdiff._solvers._value_search import ValueSearch
 
@@ -166,7 +167,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         history = History.empty(length, n, 1, theta.dtype)
         width = jnp.ones((), theta.dtype)
         search = ValueSearch.of(params, theta, params.sigma, width, history)
-        return _point_by_point.init(self, y, search, aux_struct)
+        return _point_by_point.init(self, y, search, options, aux_struct)
 
     def step(self, fn, y, args, options, state, tags):
         """The next evaluations."""
@@ -174,7 +175,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         if sizes is None:
             return _newton_batches.step(self, fn, y, args, options, state)
         parts = _point_by_point.PointStep(self, sizes, y, options, state)
-        return parts.step(Evaluator(fn, args, layout_of(y), False, None))
+        return parts.step(Evaluator(fn, parts.numbers(args), layout_of(y), False, None))
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """Where the last search leads nowhere any more, or after a failed step."""
@@ -200,6 +201,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
             y, stats = _newton_batches.judge(self, fn, y, args, options, state)
         else:
             parts = _point_by_point.PointStep(self, sizes, y, options, state)
-            y, stats = parts.judge(Evaluator(fn, args, layout_of(y), False, None).values)
+            evaluate = Evaluator(fn, args, layout_of(y), False, None)
+            y, stats = parts.judge(by_rows(evaluate, options))
             aux = state.aux
         return y, aux, stats

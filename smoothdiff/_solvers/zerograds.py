@@ -29,6 +29,7 @@ from smoothdiff._solvers._base import (
 from smoothdiff._solvers._descent import descended, in_units
 from smoothdiff._solvers._judgement import judged, judging, one_by_one
 from smoothdiff._solvers._locality import Locality, inner_width, log, share
+from smoothdiff._solvers._random_numbers import in_step
 from smoothdiff._solvers._replay import Replay
 from smoothdiff._solvers._surrogate_fit import Fit, Settings
 from smoothdiff.surrogates import MLP
@@ -243,7 +244,7 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
         progress = state.progress
         params = smoothed_params(self, y, progress.step, options)
         locality = self._locality(params, y, progress.step, options)
-        rho, batch = locality.around(watched(fn, args))
+        rho, batch = locality.around(watched(fn, in_step(args, options, progress.step)))
         seen = batch.aux.lowest()
         _, rest = self._make(params, options)
         fit = state.fit.updated(
@@ -269,9 +270,8 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
             moved, length = self.norm(jax.tree.map(jnp.subtract, new_y, y)), self.norm(y)
             stall = jnp.where(moved < self.atol + self.rtol * length, state.stall + 1, 0)
         finite = all_finite((fit.weights, fit.spread, new_y))
-        new_y, fit, opt_state = unless_failed(
-            finite, (new_y, fit, opt_state), (y, state.fit, state.opt_state)
-        )
+        new, old = (new_y, fit, opt_state), (y, state.fit, state.opt_state)
+        new_y, fit, opt_state = unless_failed(finite, new, old)
         fun, stderr = locality.mean(batch)
         sigma = sigma_at(self.sigma, progress.step)
         progress = progress.after(y, fun, stderr, sigma, self.num_samples, finite, seen)
@@ -292,9 +292,10 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
         def estimate(y):
             params = smoothed_params(self, y, progress.step, options)
             locality = self._locality(params, y, progress.step, options)
-            batch = locality.smoothed(watched(fn, args))
+            batch = locality.smoothed(watched(fn, in_step(args, options, progress.step)))
             return (*locality.mean(batch), batch.aux.lowest())
 
         new = y, progress.best_y, progress.start_y
-        y, stats = judged(progress, one_by_one(fn, args, None), estimate, self.num_samples, new)
+        values, batch = one_by_one(fn, args, options, None), self.num_samples
+        y, stats = judged(progress, values, estimate, batch, new)
         return y, aux, stats

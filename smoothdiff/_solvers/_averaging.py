@@ -1,0 +1,59 @@
+"""What a search makes of noise: a mean of its centers, and samples far enough apart.
+
+As long as its local model predicts, a search of a function that takes random numbers gives it the
+same ones. Where the model ends, at a minimum of these numbers alone, rounds of samples with fresh
+ones follow, until the run ends. The more rounds, the nearer is the mean of their centers.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+# how strongly later centers count: as the power of their number
+_LATER = 3.0
+# the next samples are so many times as far apart, at most
+_NEARER, _FARTHER = 0.25, 1.5
+
+
+class Average(eqx.Module):
+    r"""The mean of the centers so far, in which the center of round k has a weight of about $k^3$.
+
+    So what was far away at the beginning is soon forgotten.
+
+    Source: Shamir and Zhang 2013, polynomial-decay averaging.
+    """
+
+    mean: Float[Array, " n"]
+    count: Float[Array, ""]
+
+    @staticmethod
+    def start(theta: Float[Array, " n"]) -> "Average":
+        """Of no center."""
+        return Average(theta, jnp.zeros((), theta.dtype))
+
+    def after(self, center: Float[Array, " n"]) -> "Average":
+        """With one more."""
+        count = self.count + 1
+        share = (_LATER + 1) / (_LATER + count)
+        return Average(self.mean + share * (center - self.mean), count)
+
+    def over(self, other: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The mean, or before there is one another point."""
+        return jnp.where(self.count > 0, self.mean, other)
+
+
+def apart(
+    width: Float[Array, ""], noise: Float[Array, ""], signal: Float[Array, ""]
+) -> Float[Array, ""]:
+    """How wide the next samples are at least, relative to sigma.
+
+    So wide that they differ by as much as the noise; at most one.
+
+    Args:
+        width: that of these samples.
+        noise: the root of the variance that noise has.
+        signal: the same of the function over these samples.
+    """
+    tiny = jnp.finfo(noise.dtype).tiny
+    factor = jnp.clip(noise / jnp.maximum(signal, tiny), _NEARER, _FARTHER)
+    return jnp.minimum(factor * width, 1)
