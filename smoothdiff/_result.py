@@ -103,7 +103,8 @@ class Result:
 
         NaN for a parameter at a bound, where the others' errors hold it, and for those of which the
         evaluations do not tell enough; a warning names them, and `with_covariance` evaluates more.
-        Do so, too, for a function that jumps, of which near evaluations may show one jump alone.
+        Do so, too, for a function that jumps, of which near evaluations may show one jump alone,
+        and for one that takes a key, as those with several keys tell no slopes.
         None unless the solver is `GaussNewton` with fewer than 100 parameters.
         """
         return None if self._errors is None else self._errors.covariance
@@ -159,8 +160,13 @@ class Result:
 def kept_residuals(result: Result) -> History | None:
     """The evaluations that the run has kept, if they are of residuals, point by point."""
     state = result.state
-    point_by_point = isinstance(state, PointState) and result.solver.squares
-    return state.search.history if point_by_point else None
+    if not (isinstance(state, PointState) and result.solver.squares):
+        return None
+    history = state.search.history
+    if state.search.average is not None:
+        # those with several keys differ by more than slopes do
+        history = dataclasses.replace(history, valid=history.valid & False)
+    return history
 
 
 class MinimiseError(RuntimeError):

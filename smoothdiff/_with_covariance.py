@@ -15,13 +15,14 @@ from smoothdiff._parameter_errors import Answer
 from smoothdiff._params import layout_of
 from smoothdiff._reraise import reraise
 from smoothdiff._result import NO_COVARIANCE, Result, kept_residuals
+from smoothdiff._solvers._random_numbers import keyed
 
 # how far from the answer, in standard errors: the ends of 95 % intervals
 _ERRORS = 2.0
 
 
 def with_covariance(
-    fun: Callable[[PyTree, PyTree], Any], result: Result, args: PyTree = None
+    fun: Callable[..., Any], result: Result, args: PyTree = None, *, key: Any = None
 ) -> Result:
     r"""The same result with further evaluations around its answer, for its standard errors.
 
@@ -36,6 +37,7 @@ def with_covariance(
         fun: the residuals, as for `least_squares`.
         result: what that returned.
         args: passed on to `fun`.
+        key: for a function that takes one, which is then the same in all of these evaluations.
 
     Returns:
         The result with 2 `evaluations` more for each parameter that is not at a bound, and another
@@ -44,7 +46,8 @@ def with_covariance(
 
     Raises:
         ValueError: a result without a covariance, of `minimise`, of `LocalGaussNewton` or of 100
-            parameters or more; a function with another number of residuals.
+            parameters or more; a function with another number of residuals; a key that is missing,
+            or given to a function that takes none.
         BlackBoxError: an evaluation failed.
 
     Example:
@@ -62,6 +65,14 @@ def with_covariance(
     answer, history = result.answer, kept_residuals(result)
     if answer is None or history is None:
         raise ValueError(NO_COVARIANCE)
+    took_key = result.state.search.average is not None
+    if took_key != (key is not None):
+        raise ValueError(
+            "the function of this result takes a key: write key=jax.random.key(0)"
+            if took_key
+            else "the function of this result takes no key: leave key out"
+        )
+    fun, args = keyed(fun, args, key) if took_key else (fun, args)
     size = history.rows.shape[1]
     before, values, here = answer.evaluations(history)
     points = _around(result, answer, slopes(before, values, here), size)

@@ -240,6 +240,23 @@ def test_a_function_that_ignores_the_key_has_no_noise():
     np.testing.assert_allclose(result.y, CENTER, atol=1e-2)
 
 
+def test_errors_of_the_parameters_come_from_evaluations_with_one_key():
+    data = DATA + 0.05 * jax.random.normal(jax.random.key(1), DATA.shape)
+    fun = lambda y, args, key: decay(y, args, key)
+    run = sd.least_squares(
+        fun, START, data, key=KEY, sigma=0.2, max_evaluations=100, takes_key=True
+    )
+    with pytest.warns(UserWarning, match="no error of"):
+        assert np.all(np.isnan(run.parameter_errors))
+    result = sd.with_covariance(fun, run, data, key=KEY)
+    result = sd.with_covariance(fun, result, data, key=KEY)
+    slopes = np.asarray(jax.jacobian(expected)(jnp.asarray(run.y)))
+    # the errors are those of the data and of the function's own noise
+    variance = 2 * run.fun / (len(data) - 2)
+    errors = np.sqrt(variance * np.diag(np.linalg.inv(slopes.T @ slopes)))
+    np.testing.assert_allclose(result.parameter_errors, errors, rtol=0.3)
+
+
 # its parts
 
 
@@ -310,6 +327,9 @@ def test_what_does_not_go_with_noise_is_refused():
     search = sd.Search(START, key=KEY)
     with pytest.raises(ValueError, match="write takes_key=True"):
         _ = search.key
+    run = sd.least_squares(decay, START, DATA, key=KEY, sigma=0.2, max_steps=4, takes_key=True)
+    with pytest.raises(ValueError, match="takes a key: write key="):
+        sd.with_covariance(decay, run, DATA)
     pair = {"key": KEY, "takes_key": True}
     with pytest.raises(ValueError, match=r"args=\(args, key\)"):
         optx.minimise(lambda y, args: jnp.sum(y), ADAM, START, CENTER, options=pair)
