@@ -343,6 +343,19 @@ def test_noise_is_fixed_or_follows_from_the_parameters():
     assert (first != make(noise="per_params", seed=1)(near)).any()
 
 
+def test_a_key_decides_the_noise_whatever_else_is_said():
+    sky = scene(sky={"type": "constant"})
+    near, keys = jnp.float32(1000), jax.random.split(jax.random.key(0))
+    make = lambda **kwargs: mitsuba.renderer(sky, "camera.far_clip", resolution=8, spp=1, **kwargs)
+    fixed, fresh = make(), make(noise="per_params", seed=3)
+    many = jax.jit(jax.vmap(fixed, (None, 0)))(near, keys)
+    for image, key in zip(many, keys, strict=True):
+        np.testing.assert_array_equal(image, fixed(near, key))
+        np.testing.assert_array_equal(image, fresh(near, key))
+    assert (many[0] != many[1]).any()
+    assert (many[0] != fixed(near)).any()
+
+
 def test_parameters_that_are_not_finite_never_look_like_a_picture():
     bad = jnp.array([0.0, jnp.nan, 0.0])
     with pytest.raises(BlackBoxError, match=r"not finite(.|\n)*ball.translate"):

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from smoothdiff._black_box import black_box
+from smoothdiff._params import as_key
 from smoothdiff.renderers._mitsuba_scene import (
     Axis,
     Scene,
@@ -45,7 +46,8 @@ def renderer(
 
     The function is a `smoothdiff.black_box`: it works under `jit`, `vmap`, `scan` and every
     smoothdiff transform, and has no derivative of its own. The image depends on nothing but the
-    parameters. Those that are not finite give an image of NaN, hence an error or a dropped sample.
+    parameters, and on a key if one is given: `render(y, key)`, as `minimise` with `takes_key=True`
+    does. Parameters that are not finite give an image of NaN, hence an error or a dropped sample.
 
     Args:
         scene: A dict as for `mitsuba.load_dict`, the path of an XML file, or a loaded scene. A
@@ -118,11 +120,13 @@ def renderer(
         films, size = _films(loaded, views, resolution)
     shape = size if isinstance(sensor, int) else (len(views), *size)
 
-    def render(values: dict[str, np.ndarray]) -> np.ndarray:
+    def render(values: dict[str, np.ndarray], drawn_seed: np.ndarray | None) -> np.ndarray:
         if not all(np.isfinite(value).all() for value in values.values()):
             # Mitsuba leaves out a shape that is nowhere, and what remains looks like a picture.
             return np.full(shape, np.nan, np.float32)
         noise_seed: Any = seed if noise == "fixed" else _hash(seed, values)
+        if drawn_seed is not None:
+            noise_seed = int(drawn_seed)
         with mitsuba_with(variant):
             loaded.set(films | scene_values(loaded, values, axes))
             images = [
@@ -164,11 +168,12 @@ class Renderer:
         arrays = {name: jnp.asarray(value, jnp.float32) for name, value in initial.items()}
         self.initial = next(iter(arrays.values())) if single else arrays
 
-    def __call__(self, params: Any) -> Float[Array, "*views height width 3"]:
+    def __call__(self, params: Any, key: Any = None) -> Float[Array, "*views height width 3"]:
         """Renders the scene.
 
         Args:
             params: Like `initial`.
+            key: A random key that decides the noise of this image, in place of `seed` and `noise`.
 
         Returns:
             The image, linear RGB, or one for each camera if several were asked for.
@@ -187,7 +192,9 @@ class Renderer:
                     f"{name!r} must be real numbers of shape {self._shapes[name]}, "
                     f"got {array.dtype} of shape {array.shape}"
                 )
-        return self._box({name: array.astype(jnp.float32) for name, array in arrays.items()})
+        drawn_seed = None if key is None else jax.random.bits(as_key(key), (), jnp.uint32)
+        values = {name: array.astype(jnp.float32) for name, array in arrays.items()}
+        return self._box(values, drawn_seed)
 
 
 def _hash(seed: int, values: Mapping[str, np.ndarray]) -> int:
