@@ -1,6 +1,7 @@
 """`recommend`: in words, what to choose for a function, and what it looks like around a start."""
 
 import dataclasses
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -19,6 +20,8 @@ from smoothdiff._look_around import WIDEST, View, look_around
 from smoothdiff._params import as_key, take_apart
 from smoothdiff._reraise import reraise
 from smoothdiff._run import inexact
+from smoothdiff._solvers._base import write_options
+from smoothdiff._solvers._random_numbers import in_step, keyed
 from smoothdiff._unit_space import UnitSpace
 
 # with so many parameters or more, so many random directions instead of each parameter
@@ -69,7 +72,7 @@ class Recommendation:
 
 
 def recommend(
-    fun: Callable[[PyTree, PyTree], Any],
+    fun: Callable[..., Any],
     y0: PyTree,
     args: PyTree = None,
     *,
@@ -77,6 +80,7 @@ def recommend(
     sigma: PyTree = None,
     space: PyTree = None,
     bounds: tuple[PyTree, PyTree] | None = None,
+    takes_key: bool = False,
 ) -> Recommendation:
     """Says what to choose for a function, what it looks like around y0, and what to try.
 
@@ -97,6 +101,7 @@ def recommend(
         sigma: as for `minimise`.
         space: as for `minimise`.
         bounds: as for `minimise`.
+        takes_key: as for `minimise`. Each evaluation has a key of its own, so that noise is seen.
 
     Returns:
         A `Recommendation`.
@@ -117,7 +122,8 @@ def recommend(
 
     Source: own.
     """
-    check_call(fun, y0, bounds, space)
+    check_call(fun, y0, bounds, space, takes_key)
+    fun, args = keyed(fun, args, key) if takes_key else (fun, args)
     units = UnitSpace.of(y0, space)
     if space is not None:
         fun, y0, bounds = units.wrap(fun), units.unit(y0), units.bounds()
@@ -132,11 +138,15 @@ def recommend(
     shape = _DIRECTIONS, n
     directions = np.eye(n) if each else np.asarray(jax.random.rademacher(one, shape)) / n**0.5
     further = np.asarray(jax.random.normal(other, (n,)))
-    evaluate = evaluator(fun, squares, args, y)
+    options, numbers = write_options(key, None, takes_key), itertools.count()
+
+    def row(point: np.ndarray) -> np.ndarray:
+        evaluate = evaluator(fun, squares, in_step(args, options, next(numbers)), y)
+        return np.asarray(rows_at(evaluate, jnp.asarray(point)[None], 1)[0])
 
     def rows(points: np.ndarray) -> np.ndarray:
         with reraise():
-            return np.asarray(rows_at(evaluate, jnp.asarray(points), 1))
+            return np.stack([row(point) for point in points])
 
     dtype = params.theta.dtype
     view = look_around(

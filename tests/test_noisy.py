@@ -333,3 +333,9 @@ def test_what_does_not_go_with_noise_is_refused():
     pair = {"key": KEY, "takes_key": True}
     with pytest.raises(ValueError, match=r"args=\(args, key\)"):
         optx.minimise(lambda y, args: jnp.sum(y), ADAM, START, CENTER, options=pair)
+
+
+def test_a_recommendation_sees_the_noise():
+    said = sd.recommend(decay, START, DATA, key=KEY, takes_key=True)
+    assert said.seen[0].startswith("noise: the same point twice differs by")
+    assert said.evaluations == 2 * len(START) + 4
