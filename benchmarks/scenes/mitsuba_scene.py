@@ -21,7 +21,8 @@ Description: TypeAlias = dict[str, Any]  # for mitsuba.load_dict
 Describe: TypeAlias = Callable[[Any], Description]
 # by name, as for `smoothdiff.renderers.mitsuba.renderer`: its value, of y
 Params: TypeAlias = Mapping[str, Callable[[Array], Array]]
-Picture: TypeAlias = Callable[[Array], Float[Array, "height width 3"]]
+# of y, and of a key that decides the noise if one is given
+Picture: TypeAlias = Callable[..., Float[Array, "height width 3"]]
 
 # for a scene with one lamp that is a point: no noise, and no edges of shadows that AD could see
 DIRECT = {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0}
@@ -53,7 +54,7 @@ def picture(scene: Describe, params: Params, variant: str = VARIANT, **settings:
     mi.set_variant(variant)  # transforms cannot be made before
     described = scene(mi.ScalarTransform4f())
     render = mitsuba.renderer(described, list(params), axis=UP, variant=variant, **settings)
-    return lambda y: render({key: value(y) for key, value in params.items()})
+    return lambda y, key=None: render({name: of(y) for name, of in params.items()}, key)
 
 
 def dearer(
