@@ -6,6 +6,7 @@ from smoothdiff._baselines import AbstractBaseline
 from smoothdiff._black_box import black_box
 from smoothdiff._call import Options
 from smoothdiff._check_gradient import GradientCheck, check_gradient
+from smoothdiff._coarse_to_fine import CoarseToFine, Level, coarse_to_fine
 from smoothdiff._control_variate import control_variate
 from smoothdiff._filtered_adam import filter_updates, filtered_adam, scale_by_filtered_adam
 from smoothdiff._gp import GaussianProcess
@@ -45,6 +46,7 @@ __all__ = [
     "AbstractSpace",
     "Aggregate",
     "BlackBoxError",
+    "CoarseToFine",
     "Evaluation",
     "FirstOrder",
     "GaussNewton",
@@ -55,6 +57,7 @@ __all__ = [
     "Importance",
     "Integer",
     "LeastSquares",
+    "Level",
     "LocalGaussNewton",
     "MinimiseError",
     "NewtonCG",
@@ -76,6 +79,7 @@ __all__ = [
     "ZeroGrads",
     "black_box",
     "check_gradient",
+    "coarse_to_fine",
     "control_variate",
     "difference_hvp",
     "filter_updates",

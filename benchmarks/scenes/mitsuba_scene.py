@@ -14,7 +14,7 @@ from benchmarks.scenes.meshes import Faces, Positions
 
 # the same pictures on every machine; with so few pixels it is as fast as any other variant
 VARIANT = "scalar_rgb"
-UP = (0, 0, 1)  # what objects turn about that turn
+UP = (0, 0, 1)  # what objects turn about that turn, but for a camera, which turns about any
 
 Description: TypeAlias = dict[str, Any]  # for mitsuba.load_dict
 # given an identity transform to make others from
@@ -53,7 +53,8 @@ def picture(scene: Describe, params: Params, variant: str = VARIANT, **settings:
 
     mi.set_variant(variant)  # transforms cannot be made before
     described = scene(mi.ScalarTransform4f())
-    render = mitsuba.renderer(described, list(params), axis=UP, variant=variant, **settings)
+    turning = {name.rpartition(".")[0]: UP for name in params} | {"camera": None}
+    render = mitsuba.renderer(described, list(params), axis=turning, variant=variant, **settings)
     return lambda y, key=None: render({name: of(y) for name, of in params.items()}, key)
 
 

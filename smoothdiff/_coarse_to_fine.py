@@ -1,0 +1,253 @@
+"""`coarse_to_fine`: a search on a cheap version of a function, then on dearer ones."""
+
+import dataclasses
+import itertools
+import math
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import PyTree
+
+from smoothdiff._params import as_key
+from smoothdiff._result import Record, Result
+
+# a coarse level ends where the lowest value fell by less than this share within its patience, which
+# is counted in evaluations per parameter and one more
+_PROGRESS, _LEAST, _MOST = 0.1, 6, 20
+_TINY = 1e-300
+# why all ends with a level; and why the finest one does where it found what it could
+_ENDED = "interrupted", "max_evaluations", "max_seconds"
+_WELL = "converged", "stalled", "noise"
+
+
+class Level(NamedTuple):
+    """A version of a function, and what an evaluation of it costs.
+
+    Attributes:
+        fun: as for `minimise` or `least_squares`. The residuals of two levels may differ in number.
+        cost: in any unit that all levels share: seconds, rays, time steps.
+    """
+
+    fun: Callable[[PyTree, PyTree], Any]
+    cost: float
+
+
+@dataclasses.dataclass(frozen=True)
+class CoarseToFine:
+    """What `coarse_to_fine` found.
+
+    Attributes:
+        levels: the result of each level that was reached, the coarsest first.
+        cost: of all evaluations, in those of the finest level.
+    """
+
+    levels: tuple[Result, ...]
+    cost: float
+
+    @property
+    def y(self) -> PyTree:
+        """The best point of the finest level that was reached."""
+        return self.levels[-1].y
+
+    @property
+    def fun(self) -> float:
+        """The function of that level there."""
+        return self.levels[-1].fun
+
+    @property
+    def reason(self) -> str:
+        """Why the search ended there."""
+        return self.levels[-1].reason
+
+    @property
+    def evaluations(self) -> tuple[int, ...]:
+        """Of each level."""
+        return tuple(result.evaluations for result in self.levels)
+
+
+def coarse_to_fine(
+    minimiser: Callable[..., Result],
+    levels: Sequence[Level],
+    y0: PyTree,
+    args: PyTree = None,
+    *,
+    key: Any,
+    target: float | None = None,
+    max_cost: float | None = None,
+    max_seconds: float | None = None,
+    callback: Callable[[Record], Any] | None = None,
+    **options: Any,
+) -> CoarseToFine:
+    r"""Minimises a function by way of cheaper versions of it: fewer pixels, samples or time steps.
+
+    $$ y_k \approx \arg\min_y f_k(y) \text{ from } y_{k-1}, \qquad
+       \sigma_k = \sigma_{k-1} \sqrt{c_{k-1} / c_k} $$
+
+    Far from the answer a cheap version says as much as a dear one, and a picture of few pixels has
+    fewer local minima. A level is left where it has little more to tell: when the lowest value
+    falls by less than a tenth within so many evaluations as pay for the n + 1 that the next level
+    begins with, at least 2 (n + 1) and at most 20 (n + 1). The next one begins at the best point.
+    Its sigma is smaller, as the error of a level is: both the width of a pixel and the noise of
+    random samples fall with the root of what they cost. The finest level ends as any search does.
+
+    If the finest function is lower at `y0` than what it found, it searches once more from there.
+
+    Args:
+        minimiser: `minimise` or `least_squares`.
+        levels: from the coarsest, which is the cheapest, to the finest, which is the function
+            itself.
+        y0: where to start.
+        args: passed on to the functions.
+        key: a random key.
+        target: a value of the finest level that is good enough.
+        max_cost: what all evaluations may cost, in evaluations of the finest level.
+        max_seconds: seconds after which no further step begins.
+        callback: called with each step's `Record`; all ends if it returns something true.
+        **options: as for the minimiser: `bounds`, `space`, `sigma`, `solver`, `progress`. A solver
+            is for the coarsest level.
+
+    Returns:
+        A `CoarseToFine`.
+
+    Raises:
+        TypeError, ValueError: levels without costs, or from fine to coarse; as the minimiser.
+        MinimiseError: as the minimiser.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, smoothdiff as sd
+        >>> def bar(pixels):
+        ...     x = (jnp.arange(pixels) + 0.5) / pixels
+        ...     draw = lambda y: jnp.where(jnp.abs(x - y) < 0.1, 1.0, 0.0)
+        ...     return sd.Level(lambda y, args: draw(y) - draw(0.7), cost=pixels)
+        >>> found = sd.coarse_to_fine(
+        ...     sd.least_squares, [bar(16), bar(256)], 0.2, key=jax.random.key(0), bounds=(0, 1)
+        ... )
+        >>> round(float(found.y), 2)
+        0.7
+
+    Source: own; continuation from coarse to fine as for image pyramids (Burt and Adelson, 1983).
+    """
+    _check(levels, max_cost, options)
+    search = _Search(minimiser, levels[-1].cost, args, as_key(key), max_cost, max_seconds, options)
+    y = y0
+    for level, dearer in itertools.pairwise(levels):
+        stall = _Stall(_patience(level, dearer, y0), callback)
+        found = search.run(level, y, callback=stall)
+        if stall.asked or found.reason in _ENDED or not search.room(dearer, y0):
+            return search.found()
+        y = found.y
+        search.narrower(level.cost / dearer.cost)
+    found = search.run(levels[-1], y, callback=callback, target=target)
+    if len(levels) > 1 and search.room(levels[-1], y0) and found.reason in _WELL:
+        # one that was led astray
+        value = search.value(levels[-1], y0)
+        if value < found.fun:
+            search.run(levels[-1], y0, callback=callback, target=target)
+    return search.found()
+
+
+@dataclasses.dataclass
+class _Stall:
+    """A callback that ends a level whose lowest value falls too slowly."""
+
+    patience: int
+    callback: Callable[[Record], Any] | None
+    asked: bool = False
+    mark: tuple[float, int] = (math.inf, 0)
+
+    def __call__(self, record: Record) -> bool:
+        self.asked = self.callback is not None and bool(self.callback(record))
+        value, since = self.mark
+        # values may be negative, and a tenth of them says nothing then
+        if not record.fun >= value - _PROGRESS * abs(value):
+            self.mark = record.fun, record.evaluations
+        return self.asked or record.evaluations - since >= self.patience
+
+
+@dataclasses.dataclass
+class _Search:
+    """A search in progress: the results so far, what they cost, and the options from now on."""
+
+    minimiser: Callable[..., Result]
+    unit: float
+    args: PyTree
+    key: Any
+    max_cost: float | None
+    max_seconds: float | None
+    options: dict[str, Any]
+    results: list[Result] = dataclasses.field(default_factory=list)
+    cost: float = 0.0
+    start: float = dataclasses.field(default_factory=time.monotonic)
+
+    def run(self, level: Level, y: PyTree, **ends: Any) -> Result:
+        """The search of a level."""
+        if self.max_cost is not None:
+            ends["max_evaluations"] = self._left(level)
+        if self.max_seconds is not None:
+            passed = time.monotonic() - self.start
+            ends["max_seconds"] = max(self.max_seconds - passed, 0.0)
+        key = jax.random.fold_in(self.key, len(self.results))
+        found = self.minimiser(level.fun, y, self.args, key=key, **self.options, **ends)
+        self.cost += found.evaluations * level.cost / self.unit
+        self.results.append(found)
+        return found
+
+    def room(self, level: Level, y: PyTree) -> bool:
+        """Whether a step of that level can be paid for."""
+        solver, like = self.results[-1].solver, jax.tree.map(jnp.asarray, y)
+        needed = solver.evaluations_per_step(like) + solver.final_evaluations(like)
+        return self.max_cost is None or self._left(level) >= needed
+
+    def narrower(self, share: float):
+        """The next level has the same solver, whose sigma is smaller; cost is a `share` of its."""
+        found = self.results[-1]
+        if self._squares():
+            # residuals that are left are as far away as they are large
+            share = max(share, found.fun / max(found.history[0].fun, found.fun, _TINY))
+        sigma = jax.tree.map(lambda s: s * math.sqrt(share), found.solver.sigma)
+        solver = dataclasses.replace(found.solver, sigma=sigma)
+        self.options = self.options | {"solver": solver, "sigma": None}
+
+    def value(self, level: Level, y: PyTree) -> float:
+        """The function itself at a point, which is an evaluation more."""
+        out = level.fun(y, self.args)
+        self.cost += level.cost / self.unit
+        if not self._squares():
+            return float(out)
+        return sum(float(jnp.sum(leaf**2)) / 2 for leaf in jax.tree.leaves(out))
+
+    def found(self) -> CoarseToFine:
+        """What there is so far."""
+        return CoarseToFine(tuple(self.results), self.cost)
+
+    def _squares(self) -> bool:
+        return isinstance(self.results[-1].solver, optx.AbstractLeastSquaresSolver)
+
+    def _left(self, level: Level) -> int:
+        assert self.max_cost is not None
+        return int((self.max_cost - self.cost) * self.unit / level.cost)
+
+
+def _patience(level: Level, dearer: Level, y: PyTree) -> int:
+    """Evaluations that cost what the next level begins with."""
+    n = sum(jnp.size(leaf) for leaf in jax.tree.leaves(y))
+    return int(min(max(dearer.cost / level.cost, _LEAST), _MOST) * (n + 1))
+
+
+def _check(levels: Any, max_cost: float | None, options: dict[str, Any]):
+    """Raises TypeError or ValueError for levels that are none, and options that have no place."""
+    if not levels or not all(isinstance(level, Level) for level in levels):
+        raise TypeError("levels must be a list of sd.Level(fun, cost), from coarse to fine")
+    costs = [level.cost for level in levels]
+    if not all(0 < a <= b < math.inf for a, b in itertools.pairwise([costs[0], *costs])):
+        raise ValueError(f"the costs of levels must be positive and not fall, not {costs}")
+    if max_cost is not None and not 0 < max_cost < math.inf:
+        raise ValueError(f"max_cost={max_cost} must be a positive number, or None for no limit")
+    for name in options.keys() & {"max_evaluations", "max_steps", "checkpoint"}:
+        raise ValueError(f"{name}= is of one level: use max_cost, max_seconds or target")
+    if callable(getattr(options.get("solver"), "sigma", None)):
+        raise ValueError("a solver whose sigma is a schedule cannot be for several levels")

@@ -1,0 +1,105 @@
+"""`levels`: a Mitsuba scene beside a photograph, from few pixels and samples to all of them."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from smoothdiff._coarse_to_fine import Level
+from smoothdiff.renderers._mitsuba_renderer import renderer
+
+# fewer samples of a picture than this cost what the call costs
+_SAMPLES = 1024
+# the fewest samples of a pixel, whose edges would else jump, and bounces of light, of levels that
+# are coarser than the two finest
+_FEW, _BOUNCES = 4, 3
+
+
+def levels(
+    scene: Any,
+    params: str | Sequence[str],
+    photo: Float[np.ndarray | Array, "height width 3"],
+    *,
+    spp: int,
+    integrator: dict[str, Any] | None = None,
+    inputs: Callable[[PyTree], Any] = lambda y: y,
+    coarsest: int = 8,
+    **options: Any,
+) -> list[Level]:
+    r"""A scene beside its photograph at several fidelities, for `smoothdiff.coarse_to_fine`.
+
+    $$ r_k(y) = 2^k \, (\text{image}_k(y) - \text{photo}_k) $$
+
+    From the finest level, which has the pixels of the photograph and `spp` samples of each, to the
+    coarsest each level has half as many pixels along a side and a quarter of the samples, but not
+    fewer than 4, and 1,024 in all. A photograph of fewer pixels has their means. Where the
+    integrator has a `max_depth`, the two finest levels have it and others at most 3. What a level
+    costs is its number of samples, times the depth.
+
+    Args:
+        scene: as for `renderer`; the path of a file or a dict, as each level loads its own.
+        params: as for `renderer`.
+        photo: the photograph, linear RGB, of any size. Halves of it must be whole numbers of
+            pixels, so a power of two allows most levels.
+        spp: samples of a pixel at the finest level.
+        integrator: a dict as for `mitsuba.load_dict`, or None for that of the scene, which can be
+            read only if the scene is a dict.
+        inputs: the parameters that are varied, as `renderer` takes them, as a function of y.
+        coarsest: pixels along the shorter side, which no level falls below.
+        **options: as for `renderer`: `axis`, `sensor`, `variant`, `seed`, `noise`.
+
+    Returns:
+        The levels, the coarsest first. Their functions are those of y that `least_squares` wants.
+
+    Raises:
+        ValueError: a photograph that is none; as `renderer`.
+
+    Example:
+        >>> import jax, numpy as np, smoothdiff as sd
+        >>> from smoothdiff.renderers import mitsuba
+        >>> scene = {"type": "scene", "ball": {"type": "sphere"}, "sky": {"type": "constant"},
+        ...          "camera": {"type": "perspective"}, "integrator": {"type": "direct"}}
+        >>> photo = np.ones((32, 32, 3), np.float32)
+        >>> steps = mitsuba.levels(scene, "ball.translate", photo, spp=16)
+        >>> [level.cost for level in steps]
+        [1024.0, 1024.0, 16384.0]
+    """
+    photo = np.asarray(photo, np.float32)
+    if photo.ndim != 3 or photo.shape[2] != 3:
+        raise ValueError(f"photo must be of shape (height, width, 3), not {photo.shape}")
+    if integrator is None and isinstance(scene, dict):
+        integrator = scene.get("integrator")
+
+    def level(halved: int) -> Level:
+        factor = 2**halved
+        height, width = (side // factor for side in photo.shape[:2])
+        seen = photo.reshape(height, factor, width, factor, 3).mean(axis=(1, 3))
+        samples = max(spp // 4**halved, min(spp, _FEW), math.ceil(_SAMPLES / (height * width)))
+        samples = math.ceil(math.sqrt(samples)) ** 2  # as stratified samplers want it
+        light, depth = _shallow(integrator, deep=halved < 2)
+        render = renderer(
+            scene, params, resolution=(height, width), spp=samples, integrator=light, **options
+        )
+
+        def residuals(y: PyTree, args: Any) -> Array:
+            # as long as those of the finest level, but for what is seen there alone
+            return factor * (render(inputs(y)) - seen)
+
+        return Level(residuals, float(height * width * samples * depth))
+
+    count = 0
+    while all(side % 2 ** (count + 1) == 0 for side in photo.shape[:2]) and (
+        min(photo.shape[:2]) >> (count + 1) >= coarsest
+    ):
+        count += 1
+    return [level(halved) for halved in range(count, -1, -1)]
+
+
+def _shallow(integrator: dict[str, Any] | None, deep: bool) -> tuple[dict[str, Any] | None, int]:
+    """The integrator of a level, and how often light bounces."""
+    depth = (integrator or {}).get("max_depth", 1)
+    if deep or 0 <= depth <= _BOUNCES:
+        return integrator, depth if depth > 0 else 2 * _BOUNCES
+    return {**(integrator or {}), "max_depth": _BOUNCES}, _BOUNCES

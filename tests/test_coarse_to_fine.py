@@ -1,0 +1,153 @@
+"""From coarse to fine: what is found, what it costs, and where it ends."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import smoothdiff as sd
+from tests.closed_forms import as_users_have_it
+
+KEY = jax.random.key(0)
+
+
+def bars(pixels: int) -> sd.Level:
+    """Two bars on a line: places 0.62 and 0.31 are sought."""
+    x = (np.arange(pixels) + 0.5) / pixels
+
+    def draw(y):
+        inside = np.abs(x[:, None] - np.asarray(y)[None]) < np.array([[0.1, 0.05]])
+        return inside @ np.array([1.0, 0.6])
+
+    photo = draw([0.62, 0.31])
+    scale = np.sqrt(1 / pixels)
+    residuals = sd.black_box(
+        lambda y: scale * (draw(y) - photo), jax.ShapeDtypeStruct((pixels,), jnp.float32)
+    )
+    return sd.Level(lambda y, args: residuals(y), float(pixels))
+
+
+class Counted:
+    """A level whose calls are counted where they are evaluated."""
+
+    def __init__(self, fun, cost, out):
+        self.calls = 0
+
+        def call(y):
+            self.calls += 1
+            return fun(y)
+
+        box = sd.black_box(call, jax.ShapeDtypeStruct(out, jnp.float32))
+        self.level = sd.Level(lambda y, args: box(y), cost)
+
+
+def bowls() -> list[Counted]:
+    """A bowl, and two that are like it."""
+    fun = lambda tilt: lambda y: np.asarray([y[0] - 1 + tilt, 3 * (y[1] + 2)], np.float32)
+    return [Counted(fun(tilt), cost, (2,)) for tilt, cost in ((0.3, 1.0), (0.1, 4.0), (0.0, 64.0))]
+
+
+def test_the_answer_of_the_finest_level_at_a_fraction_of_its_cost():
+    levels = [bars(16), bars(512)]
+    start, options = jnp.array([0.45, 0.35]), {"key": KEY, "bounds": (0.0, 1.0)}
+    found = sd.coarse_to_fine(sd.least_squares, levels, start, **options)
+    np.testing.assert_allclose(found.y, [0.62, 0.31], atol=2 / 512)
+    assert len(found.levels) == len(found.evaluations) == 2
+    assert found.fun == found.levels[-1].fun < 1e-3
+    alone = sd.least_squares(levels[-1].fun, start, **options)
+    assert found.cost < 0.7 * alone.evaluations
+
+
+def test_all_evaluations_are_counted_and_paid_for():
+    counted = bowls()
+    levels = [each.level for each in counted]
+    found = sd.coarse_to_fine(sd.least_squares, levels, jnp.array([3.0, 3.0]), key=KEY)
+    np.testing.assert_allclose(found.y, [1, -2], atol=1e-3)
+    calls = [each.calls for each in counted]
+    assert list(found.evaluations[:2]) == calls[:2]
+    # the start is evaluated once more at the end
+    assert found.evaluations[2] + 1 == calls[2]
+    assert found.cost == pytest.approx(calls[0] / 64 + calls[1] / 16 + calls[2])
+
+
+def test_one_level_is_the_minimiser_itself():
+    level, start = bowls()[-1].level, jnp.array([3.0, 3.0])
+    found = sd.coarse_to_fine(sd.least_squares, [level], start, key=KEY)
+    key = jax.random.fold_in(KEY, 0)
+    alone = sd.least_squares(level.fun, start, key=key)
+    np.testing.assert_array_equal(found.y, alone.y)
+    assert found.cost == alone.evaluations == found.evaluations[0]
+
+
+def test_a_number_goes_from_coarse_to_fine():
+    def rippled(ripple):
+        return lambda y, args: jnp.sum(y**2) + ripple * jnp.sum(jnp.sin(40 * y) ** 2)
+
+    levels = [sd.Level(rippled(0.0), 1.0), sd.Level(rippled(0.05), 50.0)]
+    start = jnp.array([1.7, -1.2])
+    found = sd.coarse_to_fine(sd.minimise, levels, start, key=KEY)
+    assert found.fun < 1e-3
+
+
+def test_levels_that_mislead_are_no_worse_than_the_start():
+    far = sd.Level(lambda y, args: y - 40.0, 1.0)
+    # a narrow hole at the start, and nothing else to see
+    hole = sd.Level(lambda y, args: jnp.where(jnp.abs(y - 0.2) < 0.5, y - 0.1, 7.0), 10.0)
+    found = sd.coarse_to_fine(sd.least_squares, [far, hole], jnp.zeros(1), key=KEY)
+    assert found.fun <= 0.005
+    assert len(found.levels) == 3
+
+
+@pytest.mark.parametrize("budget", [1.0, 8.0, 20.0])
+def test_costs_never_exceed_their_limit(budget):
+    counted = bowls()
+    levels = [each.level for each in counted]
+    start = jnp.array([3.0, 3.0])
+    found = sd.coarse_to_fine(sd.least_squares, levels, start, key=KEY, max_cost=budget)
+    assert found.cost <= budget
+    spent = sum(each.calls * each.level.cost for each in counted) / 64
+    assert spent == pytest.approx(found.cost)
+
+
+def test_a_target_a_callback_and_a_time_end_it():
+    levels, start = [each.level for each in bowls()], jnp.array([3.0, 3.0])
+    run = lambda **ends: sd.coarse_to_fine(sd.least_squares, levels, start, key=KEY, **ends)
+    found = run(target=1e-2)
+    assert (found.reason, len(found.levels)) == ("target", 3)
+    assert found.fun <= 1e-2
+    found = run(callback=lambda record: record.evaluations >= 3)
+    assert (found.reason, len(found.levels)) == ("callback", 1)
+    assert 3 <= found.evaluations[0] <= 4  # one to judge it
+    assert run(max_seconds=0.0).reason == "max_seconds"
+
+
+def test_a_space_holds_at_all_levels():
+    fun = lambda tilt: lambda y, args: jnp.stack([jnp.log10(y[0]) + 2 + tilt, y[1] - 3.0])
+    levels = [sd.Level(fun(0.2), 1.0), sd.Level(fun(0.0), 9.0)]
+    space = (sd.Range(1e-4, 1.0, log=True), sd.Range(0.0, 10.0))
+    found = sd.coarse_to_fine(sd.least_squares, levels, (0.5, 9.0), key=KEY, space=space)
+    np.testing.assert_allclose(jnp.stack(found.y), [0.01, 3.0], rtol=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("levels", "options", "error", "message"),
+    [
+        ([], {}, TypeError, "list of sd.Level"),
+        ([lambda y, args: y], {}, TypeError, "list of sd.Level"),
+        ([sd.Level(jnp.sin, 2.0), sd.Level(jnp.sin, 1.0)], {}, ValueError, "not fall"),
+        ([sd.Level(jnp.sin, 0.0)], {}, ValueError, "positive"),
+        ([sd.Level(jnp.sin, float("nan"))], {}, ValueError, "positive"),
+        ([bowls()[0].level], {"max_evaluations": 10}, ValueError, "max_cost"),
+        ([bowls()[0].level], {"max_cost": float("nan")}, ValueError, "max_cost"),
+        (
+            [bowls()[0].level],
+            {"solver": sd.GaussNewton(lambda step: 0.1)},
+            ValueError,
+            "schedule",
+        ),
+    ],
+)
+def test_what_cannot_work_says_what_to_write(levels, options, error, message):
+    search = as_users_have_it(sd.coarse_to_fine)
+    with pytest.raises(error, match=message):
+        search(sd.least_squares, levels, jnp.ones(2), key=KEY, **options)

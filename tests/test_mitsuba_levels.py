@@ -1,0 +1,75 @@
+"""Levels of a Mitsuba scene: what each renders, what it costs, and what is found by way of them."""
+
+import jax
+import jax.numpy as jnp
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import smoothdiff as sd
+from smoothdiff.renderers import mitsuba
+from tests.closed_forms import as_users_have_it
+from tests.test_mitsuba import scene
+
+PATH = {"type": "path", "max_depth": 8}
+
+
+def photo(resolution, spp=16, **changes):
+    mi.set_variant("scalar_rgb")
+    render = mitsuba.renderer(scene(**changes), "ball.translate", resolution=resolution, spp=spp)
+    return np.asarray(render(jnp.array([-0.5, 0.2, 0.3])))
+
+
+def test_the_finest_level_is_the_picture_minus_the_photograph():
+    seen = photo((16, 32))
+    *_, finest = mitsuba.levels(scene(), "ball.translate", seen, spp=4)
+    render = mitsuba.renderer(scene(), "ball.translate", resolution=(16, 32), spp=4)
+    y = jnp.array([0.1, 0.2, 0.3])
+    np.testing.assert_allclose(finest.fun(y, None), render(y) - seen, atol=1e-6)
+
+
+def test_coarse_levels_have_fewer_pixels_samples_and_bounces():
+    seen = np.zeros((64, 128, 3), np.float32)
+    levels = mitsuba.levels(scene(), "ball.translate", seen, spp=64, integrator=PATH)
+    y = jnp.zeros(3)
+    shapes = [jax.eval_shape(level.fun, y, None).shape for level in levels]
+    assert shapes == [(8, 16, 3), (16, 32, 3), (32, 64, 3), (64, 128, 3)]
+    samples = [8 * 16 * 9, 16 * 32 * 4, 32 * 64 * 16, 64 * 128 * 64]
+    costs = [3 * samples[0], 3 * samples[1], 8 * samples[2], 8 * samples[3]]
+    assert [level.cost for level in levels] == costs
+
+
+def test_residuals_of_all_levels_are_about_as_large():
+    seen = photo(64)
+    levels = mitsuba.levels(scene(), "ball.translate", seen, spp=16)
+    sums = [float(jnp.sum(level.fun(jnp.zeros(3), None) ** 2)) for level in levels]
+    # what is seen in the finest one alone is left out
+    assert all(0.4 * sums[-1] < coarse <= 1.05 * sums[-1] for coarse in sums)
+
+
+def test_inputs_are_a_function_of_y():
+    seen, y = photo(8), jnp.array([0.1, 0.3])
+    name = "ball.translate"
+    aside = lambda y: {name: jnp.array([y[0], 0.0, y[1]])}
+    (level,) = mitsuba.levels(scene(), [name], seen, spp=4, inputs=aside)
+    (plain,) = mitsuba.levels(scene(), name, seen, spp=4)
+    np.testing.assert_array_equal(level.fun(y, None), plain.fun(aside(y)[name], None))
+
+
+@pytest.mark.slow
+def test_a_place_is_found_for_less_than_the_finest_level_alone():
+    seen = photo(64)
+    levels = mitsuba.levels(scene(), "ball.translate", seen, spp=16)
+    options = {"key": jax.random.key(0), "bounds": (-1.0, 1.0)}
+    start = jnp.array([0.3, -0.2, 0.0])
+    found = sd.coarse_to_fine(sd.least_squares, levels, start, **options)
+    np.testing.assert_allclose(found.y, [-0.5, 0.2, 0.3], atol=0.03)
+    alone = sd.least_squares(levels[-1].fun, start, **options)
+    assert found.cost < alone.evaluations
+
+
+@pytest.mark.parametrize("shape", [(8, 8), (8, 8, 1)])
+def test_a_photograph_has_three_colours(shape):
+    levels = as_users_have_it(mitsuba.levels)
+    with pytest.raises(ValueError, match="height, width, 3"):
+        levels(scene(), "ball.translate", np.zeros(shape), spp=4)
