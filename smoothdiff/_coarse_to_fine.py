@@ -124,7 +124,7 @@ def coarse_to_fine(
         ...     draw = lambda y: jnp.where(jnp.abs(x - y) < 0.1, 1.0, 0.0)
         ...     return sd.Level(lambda y, args: draw(y) - draw(0.7), cost=pixels)
         >>> found = sd.coarse_to_fine(
-        ...     sd.least_squares, [bar(16), bar(256)], 0.2, key=jax.random.key(0), bounds=(0, 1)
+        ...     sd.least_squares, [bar(16), bar(256)], 0.4, key=jax.random.key(0), bounds=(0, 1)
         ... )
         >>> round(float(found.y), 2)
         0.7
@@ -132,7 +132,8 @@ def coarse_to_fine(
     Source: own; continuation from coarse to fine as for image pyramids (Burt and Adelson, 1983).
     """
     _check(levels, max_cost, options)
-    search = _Search(minimiser, levels[-1].cost, args, as_key(key), max_cost, max_seconds, options)
+    unit = float(levels[-1].cost)
+    search = _Search(minimiser, unit, args, as_key(key), max_cost, max_seconds, options)
     y = y0
     for level, dearer in itertools.pairwise(levels):
         stall = _Stall(_patience(level, dearer, y0), callback)

@@ -219,7 +219,7 @@ def test_a_failed_step_keeps_the_iterate_and_says_so():
     [
         ({}, ValueError, r"options=\{\"key\": jax\.random\.key\(0\)\}"),
         ({"key": 0}, TypeError, r"jax\.random\.key\(0\)"),
-        ({"key": KEY, "bound": (0, 1)}, ValueError, '"key" and "bounds"'),
+        ({"key": KEY, "bound": (0, 1)}, ValueError, '"key", "bounds" and "takes_key"'),
     ],
 )
 def test_bad_options_are_refused(options, error, match):

@@ -246,3 +246,11 @@ def test_float64_residuals_of_float32_parameters_are_no_noise(x64):
     assert result.y.dtype == jnp.float32
     assert result.evaluations == result.history[-1].evaluations + 1
     assert result.fun == pytest.approx(float(jnp.sum(fun(result.y, None) ** 2)) / 2, rel=1e-6)
+
+
+def test_a_search_that_ends_far_away_on_a_plateau_is_judged():
+    # so far away that sigma is less than the spacing of numbers there
+    solver = sd.GaussNewton(0.06, restarts=1)
+    flat = lambda y, args: jnp.full(1, 7.0) + 0 * y
+    found = sd.least_squares(flat, jnp.array([40.0]), key=KEY, solver=solver)
+    assert found.fun == 24.5

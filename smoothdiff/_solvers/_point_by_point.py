@@ -221,7 +221,9 @@ class PointStep(eqx.Module):
 
         The smoothed function is that of the model, at no further evaluation.
         """
-        progress, search, params = self.state.progress, self.state.search, self.params()
+        progress, search = self.state.progress, self.state.search
+        # the start's: a search on a plateau may end so far away that sigma is rounding there
+        params = smoothed_params(self.solver, progress.start_y, progress.step, self.options)
         unknown = jnp.asarray(jnp.nan, progress.lowest_fun.dtype)
 
         def estimate(y: PyTree) -> tuple[Array, Array, Seen]:
