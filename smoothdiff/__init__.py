@@ -29,6 +29,7 @@ from smoothdiff._smooth_first import smooth_grad, smooth_jacobian, smooth_value_
 from smoothdiff._smooth_second import smooth_hessian, smooth_hvp, smooth_quadratic
 from smoothdiff._solvers.first_order import FirstOrder
 from smoothdiff._solvers.gauss_newton import GaussNewton
+from smoothdiff._solvers.local_cross_entropy import LocalCrossEntropy
 from smoothdiff._solvers.local_gauss_newton import LocalGaussNewton
 from smoothdiff._solvers.newton_cg import NewtonCG
 from smoothdiff._solvers.zerograds import ZeroGrads
@@ -58,6 +59,7 @@ __all__ = [
     "Integer",
     "LeastSquares",
     "Level",
+    "LocalCrossEntropy",
     "LocalGaussNewton",
     "MinimiseError",
     "NewtonCG",

@@ -9,13 +9,7 @@ geometrically, and steps with it. What differs is where sigma begins:
   number for all tasks;
 * at the problem's sigma, and over the budget, as for `first_order`, which has no support.
 
-`local_cross_entropy` is one cross-entropy search in one dimension for each parameter; all share
-their evaluations. Next is a normal population, with the mean and the spread of the best quarter of
-the last one. The first is spread evenly over the bounds, whatever the start, so no search begins in
-the wrong valley.
-
-    R. Y. Rubinstein: The Cross-Entropy Method for Combinatorial and Continuous Optimization.
-    Methodology and Computing in Applied Probability 1 (1999).
+`local_cross_entropy` is the solver `LocalCrossEntropy`.
 """
 
 from collections.abc import Callable
@@ -28,15 +22,13 @@ import optax
 import smoothdiff as sd
 from benchmarks._task import MethodEntry, NotAble, Problem, Solve
 from benchmarks.methods._flat import Flat
+from benchmarks.methods._host_loop import run_by
 from benchmarks.methods.our_solvers import BETAS, RATE, SIGMA_END
 from smoothdiff._support import AbstractSupport, as_support
 
 NUM_SAMPLES = 8
 WIDEST, NARROWEST = 0.5, 0.003  # of the domain
 EVALUATIONS = 450  # until sigma has fallen
-POPULATION = 32
-ELITE = 8
-SHARE = 0.7  # of the new mean and spread; the rest is that of the generation before
 
 
 def local(problem: Problem) -> tuple[Flat, Callable[[jax.Array], jax.Array], AbstractSupport]:
@@ -97,41 +89,11 @@ def descend(
 
 
 def cross_entropy(problem: Problem) -> Solve:
-    """Compiles a generation."""
-    flat, terms, support = local(problem)
-    shape = POPULATION, flat.size
-
-    def fit(points, middle):
-        """Mean and spread of the elite of each parameter; who is as good as the last is in it."""
-        blame = jax.linear_transpose(support.at(middle), middle)
-        found = jax.vmap(lambda x: blame(terms(x))[0])(points)
-        worst = jnp.sort(found, axis=0)[ELITE - 1]
-        weights = (found <= worst).astype(flat.dtype)
-        weights = weights / weights.sum(0)
-        mean = jnp.sum(weights * points, 0)
-        variance = jnp.sum(weights * (points - mean) ** 2, 0) * ELITE / (ELITE - 1)
-        return mean, jnp.sqrt(variance)
-
-    @jax.jit
-    def begin(key):
-        layer, place = jax.random.split(key)
-        numbers = jnp.broadcast_to(jnp.arange(POPULATION, dtype=flat.dtype)[:, None], shape)
-        shuffled = jax.random.permutation(layer, numbers, independent=True)
-        even = (shuffled + jax.random.uniform(place, shape, flat.dtype)) / POPULATION
-        points = flat.low + (flat.high - flat.low) * even
-        return fit(points, (flat.low + flat.high) / 2)
-
-    @jax.jit
-    def generation(key, mean, spread):
-        z = jax.random.normal(key, shape, flat.dtype)
-        new = fit(flat.clip(mean + spread * z), mean)
-        blend = lambda old, new: (1 - SHARE) * old + SHARE * new
-        return jax.tree.map(blend, (mean, spread), new)
-
-    def step(key, i, mean, spread):
-        return begin(key) if i == 0 else generation(key, mean, spread)
-
-    return flat.iterate(step, lambda x: None)
+    """Ours by its defaults, over the whole domain."""
+    if problem.residuals is None or problem.support is None:
+        raise NotAble("needs residuals with a local support")
+    solver = sd.LocalCrossEntropy(problem.support)
+    return run_by(sd.least_squares, problem, problem.residuals, solver)
 
 
 KINDS = ("large", "program")

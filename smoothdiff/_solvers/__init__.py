@@ -27,6 +27,7 @@ but for rounding. What both rely on:
 from smoothdiff._solvers._base import AbstractSmoothSolver, Progress
 from smoothdiff._solvers.first_order import FirstOrder
 from smoothdiff._solvers.gauss_newton import GaussNewton
+from smoothdiff._solvers.local_cross_entropy import LocalCrossEntropy
 from smoothdiff._solvers.local_gauss_newton import LocalGaussNewton
 from smoothdiff._solvers.newton_cg import NewtonCG
 from smoothdiff._solvers.zerograds import ZeroGrads
@@ -35,6 +36,7 @@ __all__ = [
     "AbstractSmoothSolver",
     "FirstOrder",
     "GaussNewton",
+    "LocalCrossEntropy",
     "LocalGaussNewton",
     "NewtonCG",
     "Progress",

@@ -95,6 +95,19 @@ def check_residuals(f_struct: PyTree) -> None:
             )
 
 
+def check_terms(f_struct: PyTree, terms: jax.ShapeDtypeStruct) -> None:
+    """Raises unless the residuals are one array of real numbers, with the first axes of terms."""
+    check_residuals(f_struct)
+    leaves = jax.tree.leaves(f_struct)
+    if len(leaves) != 1 or leaves[0].shape[: len(terms.shape)] != terms.shape:
+        shapes = [leaf.shape for leaf in leaves]
+        raise ValueError(
+            f"the support maps the parameters to terms of shape {terms.shape}, but the "
+            f"residuals have shape {shapes[0] if len(shapes) == 1 else shapes}: return one "
+            "array whose first axes are those of the terms"
+        )
+
+
 def fresh_loss(
     residuals: Evaluator, points: Float[Array, "m n"], nonfinite: str
 ) -> tuple[Float[Array, ""], Float[Array, ""], Seen]:

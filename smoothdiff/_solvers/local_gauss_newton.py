@@ -37,7 +37,7 @@ from smoothdiff._solvers._residual_batch import (
     ResidualBatch,
     around,
     centred,
-    check_residuals,
+    check_terms,
     fresh_loss,
 )
 from smoothdiff._support import AbstractSupport, as_support
@@ -177,16 +177,7 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> LocalGaussNewtonState:
         """Checks what can be looked at; evaluates nothing."""
         params = smoothed_params(self, y, jnp.asarray(0, jnp.int32), options)
-        terms = jax.eval_shape(self._blamed().at(y), y)
-        check_residuals(f_struct)
-        leaves = jax.tree.leaves(f_struct)
-        if len(leaves) != 1 or leaves[0].shape[: len(terms.shape)] != terms.shape:
-            shapes = [leaf.shape for leaf in leaves]
-            raise ValueError(
-                f"the support maps the parameters to terms of shape {terms.shape}, but the "
-                f"residuals have shape {shapes[0] if len(shapes) == 1 else shapes}: return one "
-                "array whose first axes are those of the terms"
-            )
+        check_terms(f_struct, jax.eval_shape(self._blamed().at(y), y))
         dtype = params.theta.dtype
         one, none = jnp.ones((), dtype), jnp.zeros((), jnp.int32)
         return LocalGaussNewtonState(Progress.start(y, dtype), one, none)
