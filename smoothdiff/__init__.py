@@ -10,6 +10,8 @@ from smoothdiff._coarse_to_fine import CoarseToFine, Level, coarse_to_fine
 from smoothdiff._control_variate import control_variate
 from smoothdiff._filtered_adam import filter_updates, filtered_adam, scale_by_filtered_adam
 from smoothdiff._gp import GaussianProcess
+from smoothdiff._grey_box import train_grey_box
+from smoothdiff._grey_result import GreyBoxError, GreyRecord, GreyResult
 from smoothdiff._host_samples import BlackBoxError
 from smoothdiff._importance import Importance, difference_hvp
 from smoothdiff._large_steps import large_steps
@@ -54,6 +56,9 @@ __all__ = [
     "Gaussian",
     "GaussianProcess",
     "GradientCheck",
+    "GreyBoxError",
+    "GreyRecord",
+    "GreyResult",
     "HessianOperator",
     "Importance",
     "Integer",
@@ -108,5 +113,6 @@ __all__ = [
     "smooth_quadratic",
     "smooth_value_and_grad",
     "surrogates",
+    "train_grey_box",
     "with_covariance",
 ]

@@ -69,7 +69,14 @@ class Network(eqx.Module):
         return self.layers[1](self.hidden(seen))
 
 
-def network_task(full: bool, params: Params, spread: tuple[float, ...], **named: Any) -> Task:
+def network_task(
+    full: bool,
+    params: Params,
+    spread: tuple[float, ...],
+    data: int = 0,
+    others: int | None = None,
+    **named: Any,
+) -> Task:
     """The task of training the network. Its weights are y.
 
     Quick: 32 x 32 pixels, 256 pictures to train on; full: 64 x 64 and 1,024. With fewer, also a
@@ -79,15 +86,17 @@ def network_task(full: bool, params: Params, spread: tuple[float, ...], **named:
         full: As for all tasks.
         params: The parameters of the scene, of a pose, which begins with an angle.
         spread: Entries of poses are uniform between minus and plus this.
+        data: The seed of the poses of all pictures.
+        others: Pictures to judge by; by default 32, and 64.
         named: The task's name and title.
     """
-    size, cases, held_out = (64, 1024, 64) if full else (32, 256, 32)
+    size, cases, held_out = (64, 1024, others or 64) if full else (32, 256, others or 32)
     much = Effort(400_000, 3600, seeds=5) if full else Effort(16_000, 240, seeds=1)
     render, cleaner = (
         picture(mug.scene, params, resolution=size, spp=spp) for spp in (SPP, SCORE_SPP)
     )
 
-    poses = np.random.default_rng(0).uniform(-1, 1, (cases + held_out, len(spread)))
+    poses = np.random.default_rng(data).uniform(-1, 1, (cases + held_out, len(spread)))
     poses = jnp.asarray(poses * spread, jnp.float32)
     pictures = jax.jit(jax.vmap(render))(poses)
     mean = jnp.mean(pictures, axis=0)

@@ -1,5 +1,6 @@
 """Gauss-Newton by batches: many parameters, or a sigma that is a schedule."""
 
+import dataclasses
 import math
 from typing import Any
 
@@ -48,6 +49,12 @@ class BatchState(eqx.Module):
     progress: Progress
     search: BatchSearch
     restarts: Restarts | None
+
+    def jumped(self, distance: Float[Array, ""]) -> "BatchState":
+        """After a jump of so many sigmas the next samples are as far around, up to one sigma."""
+        scale = self.search.scale
+        scale = jnp.clip(distance, scale, jnp.maximum(scale, 1))
+        return dataclasses.replace(self, search=dataclasses.replace(self.search, scale=scale))
 
 
 def sizes_of(solver: Any, y: PyTree[Array]) -> tuple[int, int, int]:

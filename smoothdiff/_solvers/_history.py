@@ -42,6 +42,10 @@ class History(eqx.Module):
 
         return jax.tree.map(latest, self, History(points, rows, funs, valid))
 
+    def newest(self, count: int) -> tuple[Array, Array, Bool[Array, " count"]]:
+        """The last points, their rows, and which of them are valid."""
+        return self.points[-count:], self.rows[-count:], self.valid[-count:]
+
     def keeping_best(self, count: int) -> "History":
         """The best one is not among the `count` oldest, which come to make way."""
         best = self._best()

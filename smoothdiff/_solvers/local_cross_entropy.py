@@ -54,15 +54,17 @@ class LocalCrossEntropy(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
 
     $$ E_j = \{\text{the quarter of all } i \text{ with the lowest }
        c_{ij} = \textstyle\sum_t S_{tj} \|r_t(x_i)\|^2\}, \qquad
-       (\mu_j, s_j) \leftarrow 0.3 \, (\mu_j, s_j) + 0.7 \,
-       (\operatorname{mean}, \operatorname{std})_{i \in E_j} x_{ij} $$
+       (\mu_j, s_j) \leftarrow 0.3 \, (\mu_j, s_j) + 0.7 \, \left(
+       \operatorname{mean}_{i \in E_j} x_{ij}, \;
+       \operatorname{rms}_{i \in E_j} (x_{ij} - \mu_j)\right) $$
 
     One search in one dimension for each parameter; all of them share their evaluations. A
     population $x_i$ is normal, with mean $\mu$ and spread $s$ of each parameter by itself, and a
     parameter is judged by the sum of squares of those terms alone that it may move, so that it
     sees only their noise. The first population is spread evenly over the bounds, wherever the
-    start, so no search begins in a wrong valley, and the answer to a switch is among it. Only the
-    order of values counts: jumps, outliers and failed samples do no harm.
+    start, so no search begins in a wrong valley, and the answer to a switch is among it. The spread
+    is that around the last mean: a population that still moves stays wide. Only the order of values
+    counts, so jumps, outliers and failed samples do no harm.
 
     It pays where a term depends on one parameter or few: switches, texels, cubes that hide one
     another. Parameters that act together, many on each term, are no coordinates of valleys, and
@@ -107,7 +109,8 @@ class LocalCrossEntropy(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         True
 
     Source: Rubinstein, The Cross-Entropy Method for Combinatorial and Continuous Optimization
-    (1999); with a support, own.
+    (1999); the spread as in CMA-ES (Hansen, The CMA Evolution Strategy: A Tutorial, 2016); with a
+    support, own.
     """
 
     support: Callable[[PyTree], Array]
@@ -190,7 +193,11 @@ class LocalCrossEntropy(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         seen = ResidualBatch.of(points, rows, jnp.asarray(len(points)))
         population = ResidualBatch.of(points[:-1], rows[:-1], jnp.asarray(len(points) - 1))
 
-        theta, wide = _fit(blame, population)
+        theta, wide = jax.lax.cond(
+            anywhere,
+            lambda: _fit(blame, population),
+            lambda: _fit(blame, population, params.theta),
+        )
         share = jnp.where(anywhere, 1, _SHARE).astype(spread.dtype)
         theta = params.clip(params.theta + share * (theta - params.theta))
         wide = spread + share * (wide - spread)
@@ -262,17 +269,24 @@ def _even(params: Params, key: Array, count: int) -> Float[Array, "count n"]:
     return params.low[None] + _span(params)[None] * share
 
 
-def _fit(blame: Blame, population: ResidualBatch) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Mean and spread of the elite of each parameter; who is as good as the last is in it."""
+def _fit(
+    blame: Blame, population: ResidualBatch, middle: Float[Array, " n"] | None = None
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Mean and spread of the elite of each parameter; who is as good as the last is in it.
+
+    The spread is that around the middle of the population, by default around the mean.
+    """
     points, rows = population.points, population.rows
     terms = blame.terms(points[0]).size
     squares = jnp.sum(rows.reshape(len(rows), terms, -1) ** 2, axis=2)
     costs = jax.vmap(blame.params)(squares)
     costs = jnp.where(population.good[:, None], costs, jnp.inf)
-    worst = jnp.sort(costs, axis=0)[(len(points) + 1) // _ELITE - 1]
+    fewest = (len(points) + 1) // _ELITE
+    worst = jnp.sort(costs, axis=0)[fewest - 1]
     elite = (costs <= worst[None]) & population.good[:, None]
     count = jnp.maximum(jnp.sum(elite, axis=0), 1).astype(points.dtype)
     mean = jnp.sum(jnp.where(elite, points, 0), axis=0) / count
-    squared = jnp.sum(jnp.where(elite, (points - mean[None]) ** 2, 0), axis=0)
-    fewest = (len(points) + 1) // _ELITE
-    return mean, jnp.sqrt(squared / count * (fewest / (fewest - 1)))
+    away = points - (mean if middle is None else middle)[None]
+    squared = jnp.sum(jnp.where(elite, away**2, 0), axis=0) / count
+    # as of the fewest, so that a parameter of which many are as good looks a little further
+    return mean, jnp.sqrt(squared * (fewest / (fewest - 1)))

@@ -1,0 +1,230 @@
+"""`train_grey_box`: a network is trained by AD through a renderer that AD knows nothing of."""
+
+import functools
+import os
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, ArrayLike, PyTree
+from tqdm import tqdm
+
+from smoothdiff._grey_cases import CaseSearches
+from smoothdiff._grey_lessons import Learner, Lessons
+from smoothdiff._grey_result import GreyBoxError, GreyRecord, GreyResult
+from smoothdiff._grey_run import Answer, GreyRun, GreyState, Shown, lessons_of
+from smoothdiff._host_samples import BlackBoxError
+from smoothdiff._params import as_key, take_apart
+
+# of Adam, and what is left of it at the end
+_RATE, _DECAY = 3e-3, 0.02
+
+
+def train_grey_box(
+    model: Callable[[Array], PyTree],
+    render: Callable[[PyTree], Array],
+    pictures: ArrayLike,
+    *,
+    key: Any,
+    sigma: PyTree,
+    max_evaluations: int,
+    optim: optax.GradientTransformation | None = None,
+    lessons: int = 128,
+    cases: int = 32,
+    kept: int = 16384,
+    new_parameters: bool = True,
+    target: float | None = None,
+    max_seconds: float | None = None,
+    callback: Callable[[GreyRecord], Any] | None = None,
+    progress: bool = False,
+    checkpoint: str | os.PathLike | None = None,
+) -> GreyResult:
+    r"""Trains a network to say what to render for a picture, without labels, by a black box.
+
+    $$ \min_\phi \frac1C \sum_c \| R(g_\phi(I_c)) - I_c \|^2, \qquad
+       x_c \approx \arg\min_x \| R(x) - I_c \|^2, \qquad
+       \phi \approx \arg\min_\phi \sum_i h(g_\phi(R(x_i)) - x_i) $$
+
+    AD knows the network g and nothing of the renderer R. So the two are split: for each picture a
+    search by Gauss-Newton finds the parameters x of the renderer, and the network learns, by AD and
+    without a render, to answer what is known to be best. As a render is a picture whose parameters
+    are known, it also learns from all renders within the range of those; h is Huber's loss. Every
+    render is compared with the pictures of all cases, so that none stays in a wrong valley, and a
+    search goes on from the network's answer where that is nearer.
+
+    The renders of the searches soon look like the pictures themselves. So half of all renders are
+    of new parameters, from a kernel density estimate of those that are known to be best: then the
+    network learns from as many different pictures as there were renders, and is better on others.
+
+    A round gives some cases a step each, and then the network its lessons.
+
+    Args:
+        model: the network, any pytree with arrays of floating-point numbers, such as a module of
+            equinox: `model(picture)` gives the parameters of the renderer, an array or a pytree.
+            It stays as it is; the trained one is in the result.
+        render: the renderer, from these parameters to a picture, a JAX function or a `black_box`.
+            Renders that are NaN or infinite are left out.
+        pictures: what it is to be trained on, an array whose first axis counts the cases; each is
+            like a render.
+        key: a random key; the same key gives the same training.
+        sigma: how far from an answer to look, in the units of the parameters. A number or a pytree
+            like them.
+        max_evaluations: renders that are never exceeded. Lessons are planned for that many.
+        optim: an optax transformation. By default Adam, whose rate falls from 3e-3 to 6e-5 over the
+            lessons.
+        lessons: steps of it in a round of 64 pictures each, in the mean: an eighth of these at the
+            beginning, as there is little to learn yet, and twice as many at the end.
+        cases: so many take a step in a round.
+        kept: renders to remember, the last ones, with their pictures. With 0 there are no new
+            parameters, and a case learns from its own renders alone: for pictures that no render
+            looks like.
+        new_parameters: whether half of all renders are of new parameters. They cost as many renders
+            and no search gains from them; without them the network learns from fewer pictures.
+        target: a mean loss of the network's answers that is good enough, in the cases of a round.
+        max_seconds: seconds after which no further round begins.
+        callback: called with each round's `GreyRecord`; the training stops if it returns something
+            true.
+        progress: show a progress bar.
+        checkpoint: a file that keeps the training. The same call takes it up and ends with the same
+            network as without an interruption; with a larger `max_evaluations` it goes on.
+
+    Returns:
+        A `GreyResult`. Ctrl-C ends the training and returns what there is.
+
+    Raises:
+        GreyBoxError: a black box failed. Its `result` has what was found, the checkpoint is
+            written.
+        TypeError, ValueError: an argument that cannot work; a checkpoint of another problem.
+
+    Example:
+        >>> import equinox as eqx, jax, jax.numpy as jnp, smoothdiff as sd
+        >>> pixels = jnp.linspace(0, 1, 16)
+        >>> render = lambda x: jnp.where(jnp.abs(pixels - x) < 0.2, 1.0, 0.0)
+        >>> pictures = jax.vmap(render)(jax.random.uniform(jax.random.key(1), (64,)))
+        >>> network = eqx.nn.MLP(16, "scalar", 32, 1, key=jax.random.key(2))
+        >>> result = sd.train_grey_box(
+        ...     network, render, pictures, key=jax.random.key(0), sigma=0.3, max_evaluations=4000
+        ... )
+        >>> abs(float(result.model(render(0.35))) - 0.35) < 0.05
+        True
+
+    Source: own; the network by AD and the renderer by samples are appendix E of the paper on
+    higher-order rendering, the split is that of auxiliary coordinates (Carreira-Perpinan and Wang,
+    2014).
+    """
+    key, pictures = as_key(key), _pictures(pictures)
+    counts = {"max_evaluations": max_evaluations, "lessons": lessons, "cases": cases}
+    for name, count in counts.items():
+        if count < 1:
+            raise ValueError(f"{name}={count} must be a positive whole number")
+    if kept < 0:
+        raise ValueError(f"kept={kept} must be 0 or more")
+    weights, static = eqx.partition(model, eqx.is_inexact_array)
+    answer, shown = _parts(model, static, render, pictures, sigma)
+    searches = CaseSearches(
+        shown,
+        pictures,
+        answer.sigma.size,
+        min(cases, len(pictures)),
+        kept,
+        new_parameters and kept > 0,
+    )
+    planned = max_evaluations // searches.evaluations
+    if planned < 1:
+        raise ValueError(
+            f"max_evaluations={max_evaluations} leaves no room for a round, which takes "
+            f"{searches.evaluations} renders: allow more, or lower cases"
+        )
+    if optim is None:
+        total = sum(lessons_of(i, planned, lessons) for i in range(planned))
+        used = _adam(total)
+    else:
+        used = optim
+    taught = Lessons(answer, pictures, used)
+    known, rendered = searches.begin(key, taught.answers(weights))
+    none = jnp.zeros((), jnp.int32)
+    state = GreyState(none, Learner.start(weights, used), known, rendered)
+    run = GreyRun(searches, taught, answer, key, state, planned, lessons)
+    if checkpoint is not None:
+        settings = lessons, cases, kept, new_parameters
+        problem = {"fun": render, "model": model, "pictures": pictures, "sigma": sigma}
+        run.attach(checkpoint, **problem, optim=optim, settings=settings)
+    return _loop(run, target, max_seconds, callback, progress)
+
+
+@functools.cache
+def _adam(lessons: int) -> optax.GradientTransformation:
+    """The same object each time, or else lessons would be compiled for each training."""
+    return optax.adam(optax.linear_schedule(_RATE, _DECAY * _RATE, lessons))
+
+
+def _loop(
+    run: GreyRun,
+    target: float | None,
+    max_seconds: float | None,
+    callback: Callable[[GreyRecord], Any] | None,
+    progress: bool,
+) -> GreyResult:
+    """Rounds until something ends them."""
+    try:
+        with tqdm(total=run.planned, initial=run.rounds, disable=not progress) as bar:
+            while (reason := _reached(run, target, max_seconds)) is None:
+                record = run.round()
+                bar.set_postfix_str(f"{record.evaluations} renders, loss {record.fun:.4g}", False)
+                bar.update()
+                if callback is not None and callback(record):
+                    return run.found("callback")
+        return run.found(reason)
+    except KeyboardInterrupt:
+        return run.found("interrupted")
+    except (BlackBoxError, jax.errors.JaxRuntimeError) as error:
+        raise GreyBoxError(str(error), run.found("failed")) from (error.__cause__ or error)
+    finally:
+        run.save()
+
+
+def _reached(run: GreyRun, target: float | None, max_seconds: float | None) -> str | None:
+    """Why the training has to end here, if it has to."""
+    if target is not None and run.history and run.history[-1].fun <= target:
+        return "target"
+    if run.rounds >= run.planned:
+        return "max_evaluations"
+    if max_seconds is not None and run.seconds >= max_seconds:
+        return "max_seconds"
+    return None
+
+
+def _pictures(pictures: Any) -> Array:
+    """The pictures as one array, in floating-point numbers."""
+    pictures = jnp.asarray(pictures)
+    if pictures.ndim < 2 or len(pictures) == 0:
+        raise ValueError(
+            f"pictures must be an array whose first axis counts the cases, not {pictures.shape}"
+        )
+    if not jnp.issubdtype(pictures.dtype, jnp.floating):
+        raise TypeError(f"pictures have dtype {pictures.dtype}: use pictures.astype(float)")
+    return pictures
+
+
+def _parts(
+    model: Any, static: Any, render: Any, pictures: Array, sigma: PyTree
+) -> tuple[Answer, Shown]:
+    """Network and renderer in units of sigma, if the one goes with the other."""
+    if not callable(model) or not callable(render):
+        raise TypeError("the arguments are (model, render, pictures), two functions and an array")
+    said = jax.eval_shape(model, pictures[0])
+    zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), said)
+    params = take_apart(zeros, sigma, None)
+    if params.free:
+        raise ValueError("train_grey_box needs a sigma for every parameter of the renderer")
+    picture = jax.eval_shape(render, said)
+    if getattr(picture, "shape", None) != pictures.shape[1:]:
+        raise ValueError(
+            f"render gives {picture}, and a picture has shape {pictures.shape[1:]}: both must be "
+            "alike"
+        )
+    layout = params.layout
+    return Answer(static, params.sigma, layout), Shown(render, params.sigma, layout)

@@ -1,0 +1,121 @@
+"""What a network learns, by AD and without a render: the answers that are known to be best.
+
+For a picture of a case that is the best that was found, for a render what was rendered. So it has
+as many pictures to learn from as there were renders, of which those within the range of what is
+known to be best count. The weights of late lessons are averaged (Shamir and Zhang, Stochastic
+gradient descent for non-smooth optimization, 2013).
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+
+from smoothdiff._grey_cases import Known, Rendered
+from smoothdiff._solvers._base import promotion
+
+# cases in a lesson, and renders
+_CASES, _RENDERS = 16, 48
+# an error beyond so many sigmas may be the search's
+_DOUBT = 0.2
+# in the mean of all weights those after t lessons count about as the ninth power of t
+_LATE = 10
+
+
+class Learner(eqx.Module):
+    """The weights, their mean over late lessons, and what the optimiser remembers."""
+
+    weights: PyTree[Array]
+    mean: PyTree[Array]
+    opt_state: Any
+    taught: Int[Array, ""]
+
+    @staticmethod
+    def start(weights: PyTree[Array], optim: optax.GradientTransformation) -> "Learner":
+        """Nothing is learnt yet."""
+        with promotion():
+            opt_state = jax.tree.map(jnp.asarray, optim.init(weights))
+        return Learner(weights, weights, opt_state, jnp.zeros((), jnp.int32))
+
+
+class Lessons(eqx.Module):
+    """How a network is taught.
+
+    Args:
+        answer: (weights, picture) -> parameters in units of sigma; AD knows it.
+        pictures: Those of the cases.
+        optim: The optimiser.
+    """
+
+    answer: Callable[[PyTree, Array], Array]
+    pictures: Float[Array, "cases ..."]
+    optim: optax.GradientTransformation = eqx.field(static=True)
+
+    @eqx.filter_jit
+    def answers(
+        self, weights: PyTree[Array], chosen: Int[Array, " k"] | None = None
+    ) -> Float[Array, "k n"]:
+        """What the network says of some cases, or of all."""
+        pictures = self.pictures if chosen is None else self.pictures[chosen]
+        return jax.vmap(lambda picture: self.answer(weights, picture))(pictures)
+
+    @eqx.filter_jit
+    def teach(
+        self,
+        key: Key[Array, ""],
+        learner: Learner,
+        best: Float[Array, "cases n"],
+        rendered: Rendered,
+        within: Bool[Array, " kept"],
+    ) -> tuple[Learner, Float[Array, ""]]:
+        """One step of the optimiser on cases and renders that are drawn; and the misfit before."""
+        inputs, targets, weight = self._drawn(key, best, rendered, within)
+
+        def misfit(weights: PyTree) -> Array:
+            said = jax.vmap(lambda picture: self.answer(weights, picture))(inputs)
+            each = optax.huber_loss(said, targets, delta=_DOUBT)
+            return jnp.mean(weight[:, None] * each)
+
+        value, slope = jax.value_and_grad(misfit)(learner.weights)
+        with promotion():
+            updates, opt_state = self.optim.update(slope, learner.opt_state, learner.weights)
+            weights = optax.apply_updates(learner.weights, updates)
+            share = _LATE / (_LATE + learner.taught)
+            mean = jax.tree.map(
+                lambda old, new: (old + share * (new - old)).astype(old.dtype),
+                learner.mean,
+                weights,
+            )
+        return Learner(weights, mean, opt_state, learner.taught + 1), value
+
+    def _drawn(
+        self, key: Array, best: Array, rendered: Rendered, within: Array
+    ) -> tuple[Array, Array, Array]:
+        """Pictures, answers, and what each counts: of renders, those within the range."""
+        of_cases, of_renders = jax.random.split(key)
+        kept = len(rendered.points)
+        count = _CASES if kept else _CASES + _RENDERS
+        case = jax.random.choice(of_cases, len(self.pictures), (count,))
+        inputs, targets = self.pictures[case], best[case]
+        weight = jnp.ones(count, best.dtype)
+        if not kept:
+            return inputs, targets, weight
+        share = within.astype(best.dtype)
+        # where there are no renders to learn from, what is drawn has no weight
+        number = jax.random.choice(of_renders, kept, (_RENDERS,), p=share / jnp.sum(share))
+        there = within[number]
+        spread = there.reshape(-1, *(1,) * (inputs.ndim - 1))
+        shown = jnp.where(spread, rendered.shown[number], 0).astype(inputs.dtype)
+        points = jnp.where(there[:, None], rendered.points[number], 0)
+        weight = jnp.append(weight, there.astype(best.dtype))
+        return jnp.append(inputs, shown, axis=0), jnp.append(targets, points, axis=0), weight
+
+
+def mean_loss(known: Known) -> Float[Array, ""]:
+    """Of the best that was rendered of each case, of those that had a render."""
+    there = jnp.isfinite(known.loss)
+    return jnp.sum(jnp.where(there, known.loss, 0)) / jnp.sum(there)

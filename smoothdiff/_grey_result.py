@@ -1,0 +1,67 @@
+"""What the training of a network through a renderer gives: a record of each round, and a result."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+from jaxtyping import Array, Float, PyTree
+
+
+class GreyRecord(NamedTuple):
+    """One round of `train_grey_box`.
+
+    Attributes:
+        round: which round, from 1.
+        evaluations: renders so far.
+        seconds: time since the start, compilation included; a resumed run counts on.
+        fun: the loss of the network's answers, the mean over the cases of this round: squared
+            differences between what was rendered of them and the pictures. Of the network as it was
+            before this round's lessons.
+        known: the mean over cases of the lowest loss of any render.
+        misfit: of the network to the parameters that are known to be best, in the last lesson.
+        model: the network after the round, with its mean weights; None in the history.
+    """
+
+    round: int
+    evaluations: int
+    seconds: float
+    fun: float
+    known: float
+    misfit: float
+    model: Any = None
+
+
+@dataclasses.dataclass(frozen=True)
+class GreyResult:
+    """What `train_grey_box` found.
+
+    Attributes:
+        model: the network, with the mean of late weights.
+        parameters: the best that was rendered of each case, what the network is to answer: its
+            output with the cases as the first axis of each leaf.
+        losses: the mean squared difference of that render to the case's picture; infinite of a
+            case that had no turn.
+        fun: the loss of the network's answers in the last round, as in its `GreyRecord`; NaN before
+            the first one.
+        evaluations: renders.
+        reason: why the training stopped: "target", "max_evaluations", "max_seconds", "callback" or
+            "interrupted"; in an error "failed".
+        history: a `GreyRecord` of each round.
+        state: all of it, the renders that are kept included.
+    """
+
+    model: Any = dataclasses.field(repr=False)
+    parameters: PyTree[Array] = dataclasses.field(repr=False)
+    losses: Float[Array, " cases"] = dataclasses.field(repr=False)
+    fun: float
+    evaluations: int
+    reason: str
+    history: list[GreyRecord] = dataclasses.field(repr=False)
+    state: Any = dataclasses.field(repr=False)
+
+
+class GreyBoxError(RuntimeError):
+    """A training failed: `result` is what it had found, `__cause__` what a black box raised."""
+
+    def __init__(self, message: str, result: GreyResult):
+        super().__init__(message)
+        self.result = result

@@ -1,0 +1,230 @@
+"""Networks in front of a renderer: known optima, counting, what is saved, faults, bad input."""
+
+import functools
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+import smoothdiff as sd
+from smoothdiff._grey_cases import Rendered, like
+from smoothdiff._grey_run import lessons_of
+
+DRAWING = np.array([[1.0, -2.0], [0.5, 0.3], [0.2, 0.4], [-1.0, 0.1]])
+POSES = np.random.default_rng(1).normal(size=(16, 2))
+ADAM = optax.adam(0.05)
+EACH = 6 + 2  # renders of a search in a round, of two parameters
+RENDERED = []
+
+
+class Linear(eqx.Module):
+    """A network without hidden layers, whose answer is a pytree."""
+
+    weight: jax.Array
+    name: str = "a field that is no array"
+
+    def __call__(self, picture):
+        said = self.weight @ picture.ravel()
+        return {"x": said[0], "y": said[1:]}
+
+
+def render(at):
+    """Four pixels of two parameters, so that the exact network is the pseudoinverse."""
+    drawing = jnp.asarray(DRAWING, at["x"].dtype)
+    return (drawing @ jnp.append(at["x"], at["y"])).reshape(2, 2)
+
+
+def watched(at):
+    jax.debug.callback(lambda x: RENDERED.append(float(x)), at["x"])
+    return render(at)
+
+
+def fails(at):
+    """In a corner of its parameters, in which no picture is."""
+    bad = at["x"] > np.max(POSES[:, 0]) + 0.1
+    return jnp.where(bad, jnp.nan, watched(at))
+
+
+def train(render=render, dtype: Any = np.float32, **rest):
+    pictures = (POSES @ DRAWING.T).reshape(-1, 2, 2).astype(dtype)
+    call = {"key": jax.random.key(0), "sigma": 0.5, "optim": ADAM, "lessons": 16} | rest
+    call = {"max_evaluations": 16 * 2 * EACH * 5, "kept": 1024} | call
+    return sd.train_grey_box(Linear(jnp.zeros((2, 4), dtype)), render, pictures, **call)
+
+
+def loss(model):
+    """Of the network, on poses that it was not trained on."""
+    poses = np.random.default_rng(2).normal(size=(64, 2))
+    said = np.asarray(poses @ DRAWING.T, np.float32) @ np.asarray(model.weight, np.float32).T
+    return np.mean((said @ DRAWING.T - poses @ DRAWING.T) ** 2)
+
+
+def test_a_network_is_trained_without_labels():
+    records = []
+    result = train(callback=lambda record: records.append(record))
+    assert loss(result.model) < 1e-2 * loss(Linear(jnp.zeros((2, 4))))
+    assert result.model.name == "a field that is no array"
+    assert (result.reason, result.evaluations) == ("max_evaluations", 5 * 16 * 2 * EACH)
+    # the searches know more than the network
+    found = np.column_stack([result.parameters["x"], result.parameters["y"]])
+    np.testing.assert_allclose(found, POSES, atol=1e-3)
+    assert result.losses.shape == (16,)
+    assert np.max(result.losses) < 1e-6
+    assert [r.evaluations for r in records] == [k * 16 * 2 * EACH for k in range(1, 6)]
+    np.testing.assert_array_equal(records[-1].model.weight, result.model.weight)
+    assert [r.model for r in result.history] == [None] * 5
+    # the first is that of the network as it came, which says zero of all
+    assert records[0].fun == pytest.approx(np.mean((POSES @ DRAWING.T) ** 2), rel=1e-5)
+    assert records[-1].fun < 0.1 * records[0].fun
+
+
+@pytest.mark.parametrize(("parts", "share"), [({"kept": 0}, 1), ({"new_parameters": False}, 1)])
+def test_each_part_can_be_left_out(parts, share):
+    RENDERED.clear()
+    result = train(watched, max_evaluations=16 * EACH * 5, **parts)
+    jax.effects_barrier()
+    assert result.evaluations == len(RENDERED) == 16 * EACH * 5 * share
+    assert loss(result.model) < 0.1 * loss(Linear(jnp.zeros((2, 4))))
+
+
+def test_cases_learn_from_each_other_and_not_from_renders_that_failed():
+    """One case has a step at a time, and the others see what was rendered for it."""
+    RENDERED.clear()
+    result = train(fails, cases=1, kept=64, max_evaluations=2 * EACH * 16)
+    jax.effects_barrier()
+    assert np.max(RENDERED) <= np.float32(np.max(POSES[:, 0]) + 0.1)
+    assert result.evaluations == 2 * EACH * 16
+    assert np.isfinite(result.model.weight).all()
+    assert np.isfinite(result.losses).all()
+    alone = train(fails, cases=1, kept=0, max_evaluations=EACH * 8)
+    assert np.isfinite(alone.losses).sum() == 8
+
+
+def test_float64(x64):
+    result = train(dtype=np.float64, max_evaluations=16 * 2 * EACH * 2)
+    assert result.model.weight.dtype == np.float64
+    assert result.parameters["y"].dtype == np.float64
+    assert np.max(result.losses) < 1e-4
+
+
+def test_a_sigma_for_each_parameter_and_a_target():
+    result = train(sigma={"x": 0.3, "y": np.array([0.8])}, target=0.5, max_evaluations=4096)
+    assert result.reason == "target"
+    assert result.fun <= 0.5
+    assert result.history[-2].fun > 0.5
+
+
+def test_a_training_that_was_killed_is_taken_up(tmp_path):
+    path = tmp_path / "grey.npz"
+    whole = train()
+
+    class StopHereError(Exception):
+        pass
+
+    def kill(record):
+        if record.round == 2:
+            raise StopHereError
+
+    with pytest.raises(StopHereError):
+        train(checkpoint=path, callback=kill)
+    rounds = []
+    resumed = train(checkpoint=path, callback=lambda record: rounds.append(record.round))
+    assert rounds == [3, 4, 5]
+    np.testing.assert_array_equal(resumed.model.weight, whole.model.weight)
+    np.testing.assert_array_equal(resumed.losses, whole.losses)
+    assert resumed.history[0].fun == whole.history[0].fun
+    with pytest.raises(ValueError, match=r"another problem: its [\w, ]*\bsigma\b"):
+        train(checkpoint=path, sigma=0.4)
+    with pytest.raises(ValueError, match=r"another problem: its [\w, ]*\bsettings\b"):
+        train(checkpoint=path, kept=0)
+
+
+def test_a_callback_and_ctrl_c_end_it_with_what_there_is():
+    result = train(callback=lambda record: record.round == 2)
+    assert (result.reason, len(result.history)) == ("callback", 2)
+    assert train(max_seconds=0.0).reason == "max_seconds"
+
+    def interrupt(record):
+        raise KeyboardInterrupt
+
+    result = train(callback=interrupt)
+    assert (result.reason, result.evaluations) == ("interrupted", 16 * 2 * EACH)
+
+
+def test_a_black_box_that_breaks_loses_nothing(tmp_path):
+    calls = []
+
+    def host(x, y):
+        calls.append(1)
+        if len(calls) > 16 * 2 * EACH:
+            raise OSError("no more licences")
+        return (DRAWING @ np.append(x, y)).reshape(2, 2).astype(np.float32)
+
+    box = sd.black_box(host, jax.ShapeDtypeStruct((2, 2), np.float32))
+    with pytest.raises(sd.GreyBoxError, match="no more licences") as error:
+        train(lambda at: box(at["x"], at["y"]), checkpoint=tmp_path / "grey.npz")
+    assert isinstance(error.value.__cause__, OSError)
+    assert error.value.result.evaluations == 16 * 2 * EACH
+    assert np.isfinite(error.value.result.losses).all()
+    assert (tmp_path / "grey.npz").exists()
+
+
+def test_new_parameters_are_spread_like_those_found(key):
+    scale = jnp.array([1.0, 20.0, 0.0])
+    found = scale[None] * jax.random.uniform(key, (256, 3)) + 5
+    new = like(jax.random.key(1), found, (40, 50)).reshape(-1, 3)
+    assert (new >= found.min(0)[None]).all()
+    assert (new <= found.max(0)[None]).all()
+    np.testing.assert_allclose(new.std(0), found.std(0), rtol=0.15)
+    # hardly any is one of those found
+    assert len(np.unique(new[:, 0])) > 1500
+
+
+def test_the_last_renders_are_kept_and_those_within_the_range_count():
+    first = Rendered(jnp.full((3, 1), jnp.nan), jnp.full((3, 2), jnp.nan))
+    rendered = first.after(jnp.array([[1.0], [5.0]]), jnp.ones((2, 2)))
+    rendered = rendered.after(jnp.array([[2.0]]), jnp.array([[1.0, jnp.nan]]))
+    np.testing.assert_array_equal(rendered.points[:, 0], [1.0, 5.0, 2.0])
+    best = jnp.array([[0.0], [3.0]])
+    np.testing.assert_array_equal(rendered.within(best), [True, False, False])
+    more = rendered.after(jnp.arange(5.0)[:, None], jnp.ones((5, 2)))
+    np.testing.assert_array_equal(more.points[:, 0], [2.0, 3.0, 4.0])
+
+
+@pytest.mark.parametrize(("planned", "each"), [(1, 8), (2, 100), (25, 128)])
+def test_lessons_become_more_and_are_as_many_as_were_asked_for(planned, each):
+    all_of_them = [lessons_of(number, planned, each) for number in range(planned)]
+    assert np.all(np.diff(all_of_them) >= 0)
+    if planned > 1:
+        assert np.mean(all_of_them) == pytest.approx(each, abs=1)
+    assert lessons_of(planned + 5, planned, each) == all_of_them[-1] >= 1
+
+
+def test_bad_arguments():
+    for name in ("max_evaluations", "lessons", "cases"):
+        with pytest.raises(ValueError, match=f"{name}=0"):
+            train(**{name: 0})
+    with pytest.raises(ValueError, match="kept=-1"):
+        train(kept=-1)
+    with pytest.raises(ValueError, match="no room for a round, which takes 256 renders"):
+        train(max_evaluations=100)
+    with pytest.raises(ValueError, match="both must be alike"):
+        train(lambda at: render(at)[0])
+    with pytest.raises(ValueError, match="sigma for every parameter"):
+        train(sigma={"x": 0.5, "y": None})
+    with pytest.raises(ValueError, match="sigma"):
+        train(sigma=0.0)
+    model, call = Linear(jnp.zeros((2, 4))), {"key": jax.random.key(0), "sigma": 0.5}
+    begin = functools.partial(sd.train_grey_box, max_evaluations=9, **call)
+    with pytest.raises(TypeError, match="two functions and an array"):
+        begin(jnp.zeros((2, 4)), render, np.zeros((3, 2, 2), np.float32))  # pyright: ignore
+    with pytest.raises(ValueError, match="first axis counts the cases"):
+        begin(model, render, np.zeros((0, 2, 2), np.float32))
+    with pytest.raises(TypeError, match="astype"):
+        begin(model, render, np.zeros((3, 2, 2), int))
+    with pytest.raises(TypeError, match="key"):
+        begin(model, render, np.zeros((3, 2, 2), np.float32), key=0)
