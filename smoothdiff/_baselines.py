@@ -51,10 +51,12 @@ class AbstractBaseline(eqx.Module):
 
     An estimate stays unbiased when what is subtracted from sample i does not depend on sample i.
     `termwise` says that what is subtracted from a term is a constant, so that the parameters which
-    cannot influence the term are not blamed for the baseline either.
+    cannot influence the term are not blamed for the baseline either. `slope` says that it needs the
+    derivative by AD at theta, with respect to z, in place of f(theta).
     """
 
     termwise: ClassVar[bool] = True
+    slope: ClassVar[bool] = False
 
     def evaluations(self) -> int:
         """Evaluations of the function, out of `num_samples`, that the baseline itself needs."""
@@ -79,8 +81,8 @@ class AbstractBaseline(eqx.Module):
     ) -> Control:
         """Subtracts the baseline from `values`, whose leaves have one leading row per sample.
 
-        `center` is f(theta) if `evaluations()` asked for it, else None. Traced by JAX, always: no
-        value can be looked at.
+        `center` is f(theta), or its slope, if `evaluations()` asked for it, else None. Traced by
+        JAX, always: no value can be looked at.
         """
 
 

@@ -82,8 +82,12 @@ def evaluate(
         return values, aux, log_ratio
 
     values, aux, log_ratio = draws.map(rows)
-    center = fun(params.clip(theta), params.free)[0] if extra else None
     _check_values(values)
+    center = None
+    if baseline.slope:
+        center = _slope(lambda z: row(z, params.free)[0], jnp.zeros_like(theta))
+    elif extra:
+        center = fun(params.clip(theta), params.free)[0]
     if support is not None:
         if params.free:
             raise ValueError("support needs a sigma for every leaf of the parameters")
@@ -105,6 +109,17 @@ def evaluate(
     if params.sound is not None:
         scale = jnp.where(params.sound, scale, jnp.nan)
     return Batch(draws, values, control, log_ratio, valid, scale, aux, support, params.layout)
+
+
+def _slope(fun: Callable[[Array], PyTree], z: Array) -> Array:
+    """The derivative by AD of a function that returns one number."""
+    leaves = jax.tree.leaves(jax.eval_shape(fun, z))
+    if [leaf.shape for leaf in leaves] != [()]:
+        raise ValueError(
+            'baseline="ad" is for functions that return one number: return a loss, or use '
+            'baseline="auto"'
+        )
+    return jax.grad(lambda z: jax.tree.leaves(fun(z))[0])(z)
 
 
 def _like(rows: Array, values: Array) -> Array:

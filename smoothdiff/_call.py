@@ -35,8 +35,10 @@ class Options(TypedDict, total=False):
         noise: what smooths in place of the Gaussian, an object with `sample` and `log_prob`, see
             `Noise`. It draws its points itself, so there is no sampler then.
         baseline: what to subtract: "none", "mean" (of the other samples), "center" (f(theta), one
-            evaluation), "linear", "quadratic" or "gp" (fitted), "auto" ("gp" where it gains, else
-            "mean"), or a baseline object.
+            evaluation), "linear", "quadratic" or "gp" (fitted), "ad" (the linear function with the
+            slope that AD sees at theta, one evaluation with its gradient: for losses in which AD
+            lacks only the moving edges), "auto" ("gp" where it gains, else "mean"), or a baseline
+            object.
         support: for a function that returns an array of terms whose sum is the objective: a linear
             map from parameter-shaped to term-shaped arrays with entries 0 and 1 that says which
             terms a parameter may influence. See `local_support`.

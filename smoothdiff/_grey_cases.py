@@ -47,8 +47,8 @@ class Rendered(eqx.Module):
         """Which did not fail, and have parameters within the range of the best ones."""
         low, high = jnp.min(best, axis=0), jnp.max(best, axis=0)
         inside = (self.points >= low[None]) & (self.points <= high[None])
-        finite = jnp.isfinite(self.shown).reshape(len(self.shown), -1)
-        return inside.all(axis=1) & finite.all(axis=1)
+        finite = jnp.isfinite(self.shown).all(axis=tuple(range(1, self.shown.ndim)))
+        return inside.all(axis=1) & finite
 
 
 class CaseSearches(eqx.Module):
@@ -188,7 +188,7 @@ def like(
     """
     which, where = jax.random.split(key)
     width = jnp.std(best, axis=0) * len(best) ** (-1 / (best.shape[1] + 4))
-    points = jax.random.choice(which, best, shape)
+    points = best[jax.random.randint(which, shape, 0, len(best))]
     points += width[None, None] * jax.random.normal(where, points.shape, points.dtype)
     low, high = jnp.min(best, axis=0), jnp.max(best, axis=0)
     return jnp.clip(points, low[None, None], high[None, None])

@@ -118,4 +118,4 @@ class Lessons(eqx.Module):
 def mean_loss(known: Known) -> Float[Array, ""]:
     """Of the best that was rendered of each case, of those that had a render."""
     there = jnp.isfinite(known.loss)
-    return jnp.sum(jnp.where(there, known.loss, 0)) / jnp.sum(there)
+    return jnp.mean(known.loss, where=there)

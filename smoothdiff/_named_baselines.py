@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+from smoothdiff._ad_slope import ADSlope
 from smoothdiff._baselines import AbstractBaseline, Center, Mean, NoBaseline
 from smoothdiff._gp import GaussianProcess
 from smoothdiff._least_squares import LeastSquares
@@ -33,6 +34,7 @@ NAMED: dict[str, Callable[[], AbstractBaseline]] = {
     "linear": lambda: LeastSquares(1),
     "quadratic": lambda: LeastSquares(2),
     "gp": GaussianProcess,
+    "ad": ADSlope,
 }
 
 

@@ -87,9 +87,10 @@ def test_mean_and_spread_are_those_of_the_best_quarter(x64):
     blame = Blame.of(sd.matrix_support(matrix), lambda x: x, jnp.zeros(4))
     batch = ResidualBatch.of(jnp.asarray(points), jnp.asarray(rows), jnp.asarray(15))
     middle = rng.normal(size=4)
-    (mean, spread), (_, around) = (
+    (mean, spread, flat), (_, around, _) = (
         eqx.filter_jit(_fit)(blame, batch, of) for of in (None, jnp.asarray(middle))
     )
+    np.testing.assert_array_equal(flat, [False, False, False, True])
     costs = (rows.reshape(15, 5, 2) ** 2).sum(axis=2) @ matrix
     for j in range(4):
         elite = np.delete(points[:, j], 2) if j == 3 else points[np.argsort(costs[:, j])[:4], j]

@@ -1,7 +1,6 @@
 """The methods of the benchmarks: each makes progress, stays within bounds, and is counted right."""
 
 import contextlib
-import dataclasses
 import json
 import sys
 from typing import get_args
@@ -15,7 +14,7 @@ from jax.flatten_util import ravel_pytree
 from benchmarks import _registry, _study
 from benchmarks._loop import Counter, Recorder, Stop
 from benchmarks._task import Budget, Grey, Kind, NotAble, Problem
-from benchmarks.methods import grey_box, grey_gauss_newton, higher_order
+from benchmarks.methods import grey_box, higher_order
 from benchmarks.methods._flat import Flat
 from benchmarks.methods.higher_order import _move, _turn
 
@@ -312,55 +311,12 @@ def test_grey_boxes_train_a_network(name, monkeypatch):
     assert problem.loss(found[-1]) < 0.05 * problem.loss(jnp.zeros(8))
 
 
-@pytest.fixture
-def few_lessons(monkeypatch):
-    """What a linear network needs to learn."""
-    monkeypatch.setattr(grey_gauss_newton, "RATE", 0.05)
-    monkeypatch.setattr(grey_gauss_newton, "LESSONS", (8, 24))
-
-
 @pytest.mark.slow
-def test_gauss_newton_finds_what_a_network_is_to_answer(few_lessons):
+def test_gauss_newton_finds_what_a_network_is_to_answer():
     problem = linear_grey()
-    evaluations, found, _ = ran("grey_gauss_newton", problem, jnp.zeros(8))
+    evaluations, found, counter = ran("grey_gauss_newton", problem, jnp.zeros(8))
     # all cases at once; a step of each, two to choose between the network and the solver, and as
     # many that are there to be learnt from
     assert evaluations[0] == 16 * 2 * (6 + 2)
-    assert problem.loss(found[-1]) < 1e-4 * problem.loss(jnp.zeros(8))
-
-
-@pytest.mark.slow
-def test_cases_learn_from_each_other_and_not_from_renders_that_failed(few_lessons, monkeypatch):
-    """A renderer that fails in a corner of its parameters, in which no picture is."""
-    grey = linear_grey().grey
-    assert grey is not None
-    failed = []
-
-    def fails(x):
-        bad = x[0] > 2.2
-        jax.debug.callback(lambda bad: failed.append(bool(bad)), bad)
-        return jnp.where(bad, jnp.nan, grey.render(x))
-
-    problem = dataclasses.replace(linear_grey(), grey=grey._replace(render=fails), loss=grey.loss)
-    # one case has a step at a time, and the others see what was rendered for it
-    monkeypatch.setattr(grey_gauss_newton, "CASES", 1)
-    # fewer renders are kept than made
-    monkeypatch.setattr(grey_gauss_newton, "KEPT", 512)
-    evaluations, found, _ = ran("grey_gauss_newton", problem, jnp.zeros(8))
-    assert evaluations[0] == 2 * (6 + 2)
-    jax.effects_barrier()
-    assert any(failed)
-    assert np.isfinite(found).all()
-    # each case has had two steps when all have learned from 32 of them
-    assert problem.loss(found[2 * 16 - 1]) < 0.2 * problem.loss(jnp.zeros(8))
-
-
-def test_new_poses_are_spread_like_those_found(key):
-    scale = jnp.array([1.0, 20.0, 0.0])
-    found = scale[None] * jax.random.uniform(key, (256, 3)) + 5
-    poses = grey_gauss_newton._like(jax.random.key(1), found, (40, 50)).reshape(-1, 3)
-    assert (poses >= found.min(0)[None]).all()
-    assert (poses <= found.max(0)[None]).all()
-    np.testing.assert_allclose(poses.std(0), found.std(0), rtol=0.15)
-    # hardly any is one of those found
-    assert len(np.unique(poses[:, 0])) > 1500
+    assert counter.evaluations <= problem.budget.evaluations
+    assert problem.loss(found[-1]) < 0.1 * problem.loss(jnp.zeros(8))

@@ -193,7 +193,7 @@ class LocalCrossEntropy(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         seen = ResidualBatch.of(points, rows, jnp.asarray(len(points)))
         population = ResidualBatch.of(points[:-1], rows[:-1], jnp.asarray(len(points) - 1))
 
-        theta, wide = jax.lax.cond(
+        theta, wide, flat = jax.lax.cond(
             anywhere,
             lambda: _fit(blame, population),
             lambda: _fit(blame, population, params.theta),
@@ -201,9 +201,9 @@ class LocalCrossEntropy(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         share = jnp.where(anywhere, 1, _SHARE).astype(spread.dtype)
         theta = params.clip(params.theta + share * (theta - params.theta))
         wide = spread + share * (wide - spread)
-        # on a plateau there is nothing to learn, so the next population is wider
+        # where a parameter has moved nothing there is nothing to learn but that it is too narrow
         widest = jnp.minimum(_span(params), _WIDEST * params.sigma)
-        wide = jnp.where(population.same(), jnp.minimum(2 * spread, widest), wide)
+        wide = jnp.where(flat, jnp.minimum(2 * spread, widest), wide)
         fun, stderr = population.loss()
 
         new_y = params.layout.tree(theta)
@@ -271,10 +271,11 @@ def _even(params: Params, key: Array, count: int) -> Float[Array, "count n"]:
 
 def _fit(
     blame: Blame, population: ResidualBatch, middle: Float[Array, " n"] | None = None
-) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+) -> tuple[Float[Array, " n"], Float[Array, " n"], Bool[Array, " n"]]:
     """Mean and spread of the elite of each parameter; who is as good as the last is in it.
 
-    The spread is that around the middle of the population, by default around the mean.
+    The spread is that around the middle of the population, by default around the mean. Also whether
+    the whole population is as good.
     """
     points, rows = population.points, population.rows
     terms = blame.terms(points[0]).size
@@ -289,4 +290,5 @@ def _fit(
     away = points - (mean if middle is None else middle)[None]
     squared = jnp.sum(jnp.where(elite, away**2, 0), axis=0) / count
     # as of the fewest, so that a parameter of which many are as good looks a little further
-    return mean, jnp.sqrt(squared * (fewest / (fewest - 1)))
+    flat = jnp.all(elite | ~population.good[:, None], axis=0)
+    return mean, jnp.sqrt(squared * (fewest / (fewest - 1))), flat
