@@ -9,12 +9,21 @@ import numpy as np
 import optax
 from jaxtyping import Array, PyTree
 
-from smoothdiff._solvers import FirstOrder, GaussNewton, LocalGaussNewton, NewtonCG
+from smoothdiff._solvers import (
+    FirstOrder,
+    GaussNewton,
+    LocalCrossEntropy,
+    LocalGaussNewton,
+    NewtonCG,
+)
+from smoothdiff._support import MovingSupport, as_support
 
 # sigma as a share of a parameter's range, or else of the largest number of its leaf
 _SHARE = 0.2
 # a step of Adam, in sigmas
 _RATE = 0.15
+# so many parameters on a term, in the mean, can be searched for by themselves
+_FEW = 10
 
 
 def default_sigma(y: PyTree[Array], bounds: tuple[PyTree, PyTree] | None) -> PyTree[Array]:
@@ -23,12 +32,7 @@ def default_sigma(y: PyTree[Array], bounds: tuple[PyTree, PyTree] | None) -> PyT
     It is 0.2 where all numbers of a leaf without a range are zero.
     """
     leaves, treedef = jax.tree.flatten(y)
-    none = (None,) * len(leaves)
-    sides = none, none
-    if bounds is not None:
-        full = [jax.tree.broadcast(side, y, is_leaf=lambda b: b is None) for side in bounds]
-        sides = tuple(treedef.flatten_up_to(side) for side in full)
-    return treedef.unflatten(map(_width, leaves, *sides))
+    return treedef.unflatten(map(_width, leaves, *_sides(y, bounds)))
 
 
 def default_solver(
@@ -37,8 +41,12 @@ def default_solver(
     sigma: PyTree | None,
     residuals: bool,
     support: Callable[[PyTree], Array] | None = None,
+    anywhere: bool = False,
 ) -> Any:
-    """The rule that `minimise` and `least_squares` state."""
+    """The rule that `minimise` and `least_squares` state.
+
+    `anywhere` says that no sigma is the user's, who does not ask to look around the start.
+    """
     usual = default_sigma(y, bounds)
     if sigma is None:
         sigma = usual
@@ -47,11 +55,41 @@ def default_solver(
         full = jax.tree.broadcast(sigma, y, is_leaf=_is_none)
         sigma = jax.tree.map(lambda s, d: d if s is None else s, full, usual, is_leaf=_is_none)
     if residuals:
-        return GaussNewton(sigma) if support is None else LocalGaussNewton(sigma, support)
+        if support is None:
+            return GaussNewton(sigma)
+        if anywhere and _all_bounded(y, bounds) and _few_on_a_term(y, support):
+            return LocalCrossEntropy(support)
+        return LocalGaussNewton(sigma, support)
     # with more parameters a quadratic model takes too many evaluations
     if NewtonCG(1.0).sizes(y) is not None:
         return NewtonCG(sigma)
     return FirstOrder(optax.chain(optax.scale_by_adam(), _in_sigmas(sigma)), sigma)
+
+
+def _sides(y: PyTree[Array], bounds: tuple[PyTree, PyTree] | None) -> tuple[list, list]:
+    """The bounds of each leaf, None where it has none."""
+    low, high = (None, None) if bounds is None else bounds
+    treedef = jax.tree.structure(y)
+    low, high = (jax.tree.broadcast(side, y, is_leaf=_is_none) for side in (low, high))
+    return treedef.flatten_up_to(low), treedef.flatten_up_to(high)
+
+
+def _all_bounded(y: PyTree[Array], bounds: tuple[PyTree, PyTree] | None) -> bool:
+    """Whether each parameter has two finite ends."""
+    return all(
+        side is not None and bool(np.all(np.isfinite(side)))
+        for sides in _sides(y, bounds)
+        for side in sides
+    )
+
+
+def _few_on_a_term(y: PyTree[Array], support: Any) -> bool:
+    """Whether the support stays where it is, and few parameters move a term."""
+    support = as_support(support)
+    if support is None or isinstance(support, MovingSupport):
+        return False
+    on_each = np.asarray(support(jax.tree.map(jnp.ones_like, y)))
+    return float(np.sum(on_each)) <= _FEW * np.count_nonzero(on_each)
 
 
 def _is_none(leaf: Any) -> bool:

@@ -170,8 +170,10 @@ def least_squares(
         y0: where to start, a pytree of numbers and arrays.
         args: passed on to `fun`.
         key: a random key; the same key gives the same run.
-        solver: how to step. By default `GaussNewton(sigma)`; `LocalGaussNewton(sigma, support)` if
-            there is a `support`. An optimistix solver around one is as good.
+        solver: how to step. By default `GaussNewton(sigma)`. With a `support`,
+            `LocalCrossEntropy(support)` where no sigma is given, each parameter has finite bounds,
+            the support does not move, and a term has at most ten parameters in the mean; else
+            `LocalGaussNewton(sigma, support)`. An optimistix solver around one is as good.
         sigma: as for `minimise`.
         support: which residuals each parameter may move, as for `LocalGaussNewton`.
         target: as for `minimise`; half the sum of squares.
@@ -237,7 +239,7 @@ def _run(
     space, bounds, takes_key = where
     check_call(fun, y0, bounds, space, takes_key)
     fun, args = keyed(fun, args, key) if takes_key else (fun, args)
-    units = UnitSpace.of(y0, space)
+    units, anywhere = UnitSpace.of(y0, space), sigma is None
     if space is not None:
         fun, y0 = units.wrap(fun), units.unit(y0)
         bounds = units.bounds()
@@ -245,7 +247,7 @@ def _run(
     y = jax.tree.map(inexact, y0)
     if solver is None:
         residuals = interface is optx.AbstractLeastSquaresSolver
-        solver = default_solver(y, bounds, sigma, residuals, support)
+        solver = default_solver(y, bounds, sigma, residuals, support, anywhere)
     else:
         check_solver(solver, interface, example, sigma, support)
         solver = solver if isinstance(solver, AbstractSmoothSolver) else Wrapped(solver)

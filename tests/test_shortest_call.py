@@ -10,6 +10,7 @@ import pytest
 from closed_forms import as_users_have_it
 
 import smoothdiff as sd
+from smoothdiff._default_solver import default_solver
 
 KEY = jax.random.key(0)
 minimise, least_squares = as_users_have_it(sd.minimise), as_users_have_it(sd.least_squares)
@@ -58,6 +59,26 @@ def test_many_parameters_get_first_order_and_a_support_its_own_solver():
         terms, y0, key=KEY, sigma=0.2, support=lambda y: y, max_evaluations=400
     )
     assert isinstance(result.solver, sd.LocalGaussNewton)
+
+
+@pytest.mark.parametrize(
+    ("chosen", "change"),
+    [
+        (sd.LocalCrossEntropy, {}),
+        (sd.LocalGaussNewton, {"sigma": 0.2}),
+        (sd.LocalGaussNewton, {"bounds": (0.0, np.inf)}),
+        (sd.LocalGaussNewton, {"bounds": (0.0, None)}),
+        (sd.LocalGaussNewton, {"bounds": None}),
+        (sd.LocalGaussNewton, {"support": sd.moving_support(lambda at: lambda y: y)}),
+        (sd.LocalGaussNewton, {"support": sd.local_support(6, ndim=1)}),
+    ],
+)
+def test_a_term_with_few_parameters_within_bounds_gets_cross_entropy(chosen, change):
+    call = {"bounds": (0.0, 1.0), "sigma": None, "support": lambda y: y} | change
+    sigma = call["sigma"]
+    bounds, support = call["bounds"], call["support"]
+    found = default_solver(jnp.zeros(100), bounds, sigma, True, support, sigma is None)
+    assert isinstance(found, chosen)
 
 
 @pytest.mark.parametrize(
