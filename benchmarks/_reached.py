@@ -1,0 +1,129 @@
+"""Who got there: the table in which a run ends, and the lines for those that did not."""
+
+import math
+from typing import Any, NamedTuple
+
+from benchmarks._grid import Grid, Row, short, spread
+from benchmarks._names import is_ours, name_of
+from benchmarks._summary import REDUCTIONS, able
+
+ERROR = "image_error"
+SOLVED = "99"  # percent: what counts as solved
+ENTERED = "90"  # percent: who gets as far is in the table
+MARK = "» "  # before what is ours, as a terminal may have no bold
+
+
+class Took(NamedTuple):
+    """What a level took over the starts, infinite where it is not reached."""
+
+    median: float
+    lower: float
+    upper: float
+    solved: int
+    starts: int
+
+    @property
+    def reached(self) -> bool:
+        """By more than half of the starts."""
+        return math.isfinite(self.median)
+
+
+def took(found: dict[str, Any], cost: str, level: str = SOLVED, error: str = ERROR) -> Took:
+    """What a method took to a level, by its part of the results."""
+    level_of = found["took"][error][level]
+    three = (math.inf if (q := level_of[cost][name]) is None else q for name in Took._fields[:3])
+    return Took(*three, level_of["solved"], found["starts"])
+
+
+def ranked(task: dict[str, Any]) -> list[str]:
+    """The methods that ran, the fastest to 99 % first, then those that leave least."""
+    methods = able(task)
+
+    def place(name: str) -> tuple[float, float, float]:
+        found = methods[name]
+        left = found["final"][ERROR]["median"]
+        costs = (took(found, "evaluations", level).median for level in (SOLVED, ENTERED))
+        return *costs, math.inf if left is None else left
+
+    return sorted(methods, key=place)
+
+
+def entered(task: dict[str, Any]) -> tuple[list[str], list[str]]:
+    """The methods that got to 90 % from more than half of the starts, and the others."""
+    methods, names = able(task), ranked(task)
+    there = {name: took(methods[name], "evaluations", ENTERED).reached for name in names}
+    return [n for n in names if there[n]], [n for n in names if not there[n]]
+
+
+def reached(task: dict[str, Any]) -> Grid:
+    """Of those that got there, what they took to each level, and what they left."""
+    methods, budget = able(task), task["budget"]
+    rows = []
+    for name in entered(task)[0]:
+        found = methods[name]
+        levels = found["took"][ERROR]
+        solved = f"{levels[SOLVED]['solved']}/{found['starts']}"
+        counts = (_count(levels[level], "evaluations", level == SOLVED) for level in REDUCTIONS)
+        parameters = _count(found["took"]["parameter_error"][SOLVED], "evaluations", False)
+        seconds = _count(levels[SOLVED], "seconds", True)
+        left = f"{short(_percent(found['final'][ERROR]['median']))} %"
+        cells = (solved, *counts, seconds, parameters, left)
+        rows.append(Row(name_of(name, found["title"]), cells, name, is_ours(name)))
+    return Grid(
+        title=f"{task['title']}: evaluations, and who got there",
+        caption=f"Medians [quartiles] over the starts, to 90, 99 and 99.9 % of the image error, at "
+        f"most {budget['evaluations']:,} evaluations or {budget['seconds']:g} s a run. "
+        "- is no more than half of the starts.",
+        columns=(
+            "method",
+            "99 % from",
+            *(f"to {level} %" for level in REDUCTIONS),
+            "s to 99 %",
+            "parameters 99 %",
+            "left",
+        ),
+        rows=tuple(rows),
+    )
+
+
+def others(task: dict[str, Any]) -> str:
+    """One line for those that did not get there; empty where all did."""
+    methods = able(task)
+    left = [
+        f"{name_of(name, methods[name]['title'])} "
+        f"({short(_percent(methods[name]['final'][ERROR]['median']))} %)"
+        for name in entered(task)[1]
+    ]
+    if not left:
+        return ""
+    return f"Not to 90 % from more than half of the starts, with what they leave: {', '.join(left)}."
+
+
+def not_able(task: dict[str, Any]) -> str:
+    """One line for those that could not run; empty where all could."""
+    reasons = {
+        name_of(name, found["title"]): found["not_able"]
+        for name, found in task["methods"].items()
+        if "not_able" in found
+    }
+    return " ".join(f"{who} is not able here: {why}." for who, why in reasons.items())
+
+
+def ending(results: dict[str, Any]) -> tuple[list[Grid], list[str]]:
+    """What a run ends with: the tables of those that got there, ours marked, and a few lines."""
+    grids, lines = [], []
+    for task in filter(able, results["tasks"].values()):
+        grid = reached(task)
+        rows = (row._replace(name=MARK * row.strong + row.name) for row in grid.rows)
+        grids.append(grid._replace(rows=tuple(rows)))
+        lines.append(others(task))
+    lines += [not_able(task) for task in results["tasks"].values()]
+    return grids, list(dict.fromkeys(filter(None, lines)))
+
+
+def _count(level: dict[str, Any], cost: str, with_quartiles: bool) -> str:
+    return spread(level[cost]) if with_quartiles else short(level[cost]["median"])
+
+
+def _percent(share: float | None) -> float | None:
+    return None if share is None else 100 * share
