@@ -96,7 +96,9 @@ def others(task: dict[str, Any]) -> str:
     ]
     if not left:
         return ""
-    return f"Not to 90 % from more than half of the starts, with what they leave: {', '.join(left)}."
+    return (
+        f"Not to 90 % from more than half of the starts, with what they leave: {', '.join(left)}."
+    )
 
 
 def not_able(task: dict[str, Any]) -> str:

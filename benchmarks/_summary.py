@@ -112,12 +112,6 @@ def band(runs: list[Run], error: str, cost: str, costs: Any) -> list[list[float]
     return quarters(errors)
 
 
-def unable(task: dict[str, Any]) -> dict[str, str]:
-    """By title, why the others did not run."""
-    methods = task["methods"].values()
-    return {found["title"]: found["not_able"] for found in methods if "not_able" in found}
-
-
 def able(task: dict[str, Any]) -> dict[str, Any]:
     """The methods that ran on a task, by its results."""
     return {name: found for name, found in task["methods"].items() if "took" in found}

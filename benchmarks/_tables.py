@@ -5,8 +5,10 @@ from itertools import product
 from typing import Any
 
 from benchmarks._grid import Grid, Row, short, spread
-from benchmarks._pictures import GAP, errors_of, titles_of
-from benchmarks._summary import COSTS, able, unable
+from benchmarks._names import name_of
+from benchmarks._pictures import GAP, errors_of, names_of
+from benchmarks._reached import not_able
+from benchmarks._summary import COSTS, able
 
 CAPTIONS = {
     "image_error": "On renders without noise, which are not charged.",
@@ -28,9 +30,9 @@ def tables(results: dict[str, Any]) -> Iterator[Grid]:
 
 def _took(task: dict[str, Any], error: str) -> Grid:
     kind, unit = error.replace("_", " "), "" if error == "gap" else " %"
-    rows = []
-    for found in able(task).values():
-        name = found["title"]
+    names, rows = names_of({"": task}), []
+    for method, found in able(task).items():
+        name = names[method]
         for level, took in found["took"][error].items():
             there = f"{took['solved']}/{found['starts']}"
             rows.append(Row(name, (level + unit, there, *(spread(took[cost]) for cost in COSTS))))
@@ -46,15 +48,15 @@ def _took(task: dict[str, Any], error: str) -> Grid:
 
 def _left(task: dict[str, Any]) -> Grid:
     budget = task["budget"]
-    not_able = " ".join(f"{who} is not able here: {why}." for who, why in unable(task).items())
     rows = []
-    for found in able(task).values():
+    for name, found in able(task).items():
         errors = [found["final"][error] for error in ("image_error", "parameter_error")]
         shown = (spread(each) for each in (*errors, found["distance"]))
-        rows.append(Row(found["title"], (*shown, f"{found['warm_up_seconds']:.1f} s")))
+        cells = (*shown, f"{found['warm_up_seconds']:.1f} s")
+        rows.append(Row(name_of(name, found["title"]), cells))
     return Grid(
         title=f"At the end, after {budget['evaluations']} evaluations or {budget['seconds']:g} s",
-        caption=f"Distance in units of the parameters. Compilation is not charged. {not_able}",
+        caption=f"Distance in units of the parameters, without compilation. {not_able(task)}",
         columns=("method", "image error", "parameter error", "distance", "compile"),
         rows=tuple(rows),
     )
@@ -76,8 +78,8 @@ def _family(results: dict[str, Any]) -> Grid:
         caption="Median over the starts; how many got there; - is no more than half.",
         columns=("method", *tasks),
         rows=tuple(
-            Row(title, tuple(cell(task, method) for task in tasks.values()))
-            for method, title in titles_of(tasks).items()
+            Row(name, tuple(cell(task, method) for task in tasks.values()))
+            for method, name in names_of(tasks).items()
         ),
     )
 
@@ -90,7 +92,7 @@ def compare(results: dict[str, Any], committed: dict[str, Any]) -> Iterator[Grid
         for method, found in able(task).items():
             pairs = product(COSTS, (found, theirs[method])) if method in theirs else ()
             if cells := tuple(_compared(each, cost) for cost, each in pairs):
-                rows.append(Row(found["title"], cells))
+                rows.append(Row(name_of(method, found["title"]), cells))
         yield Grid(
             title=f"{task['title']}: to {COMPARED} % of the image error, here and committed",
             caption=f"Committed: {committed['command']}, {committed['machine']['cpu']}. "

@@ -1,4 +1,4 @@
-"""Lines in a plane with logarithmic axes, as what the template draws: an SVG that knows dark mode."""
+"""Lines in a plane with logarithmic axes, as numbers and texts that the template draws as SVG."""
 
 import math
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from benchmarks.studies.profiles.shares import POINTS
 from benchmarks.studies.report._scene import Scene
 
 WIDTH, HEIGHT = 360, 250  # of the whole, in units of the SVG
-LEFT, RIGHT, TOP, BOTTOM = 46, 352, 10, 214  # of what is within the axes
+LEFT, RIGHT, TOP, BOTTOM = 52, 352, 14, 214  # of what is within the axes
 MOST_TICKS = 6
 
 

@@ -1,7 +1,7 @@
-"""Who is faster: ratios of medians, quartiles that overlap, and a mean over scenes with its interval.
+"""Who is faster: ratios of medians, quartiles that overlap, and means over scenes.
 
 Where the quartiles of two methods overlap neither is called faster. A ratio is of medians, where
-both get there from more than half of the starts; where only one does there is a winner and no ratio.
+both get there from more than half of the starts; where one does there is no ratio.
 """
 
 import math
@@ -10,7 +10,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from benchmarks._reached import Took, took
+from benchmarks._reached import SOLVED, Took, took
+from benchmarks._summary import COSTS
 from benchmarks.studies.report._scene import Scene
 
 RESAMPLES, SEED, COVERED = 10_000, 0, 95  # of the bootstrap over scenes; percent
@@ -23,7 +24,7 @@ class Mean(NamedTuple):
     value: float
     low: float
     high: float
-    count: int
+    scenes: int
 
 
 class Tally(NamedTuple):
@@ -57,7 +58,8 @@ def mean(ratios: Sequence[float]) -> Mean | None:
     drawn = np.random.default_rng(SEED).choice(logs, (RESAMPLES, len(logs))).mean(axis=1)
     edge = (100 - COVERED) / 2
     low, high = np.percentile(drawn, [edge, 100 - edge])
-    return Mean(*(math.exp(each) for each in (logs.mean(), low, high)), len(ratios))
+    value, low, high = (math.exp(each) for each in (logs.mean(), low, high))
+    return Mean(value, low, high, len(ratios))
 
 
 def tally(pairs: Sequence[tuple[Took, Took]]) -> Tally:
@@ -73,26 +75,28 @@ def against_best(scenes: Sequence[Scene], cost: str) -> Tally:
     """Ours against whichever peer is best on each scene, after the fact."""
     pairs = []
     for scene in scenes:
-        if scene.ours is None or not scene.peers:
-            continue
-        best = scene.best_peers.get(cost, scene.peers[0])
-        pairs.append((took(scene.ran[scene.ours], cost), took(scene.ran[best], cost)))
+        best = scene.best_peer(cost)
+        if scene.ours is not None and best is not None:
+            pairs.append((took(scene.ran[scene.ours], cost), took(scene.ran[best], cost)))
     return tally(pairs)
 
 
 def in_one_line(scenes: Sequence[Scene]) -> str:
     """All scenes, in one line."""
-    told = []
-    for cost in ("evaluations", "seconds"):
-        found = against_best(scenes, cost)
-        wins, ties, losses = (found.verdicts[each] for each in ("win", "tie", "loss"))
-        so_much = "no scene that both solve"
-        if (of := found.mean) is not None:
-            so_much = f"{of.value:.2g}× [{of.low:.2g}, {of.high:.2g}] on {of.count} that both solve"
-        told.append(f"{cost} {so_much}, {wins} wins, {ties} ties, {losses} losses")
-    unsolved = against_best(scenes, "evaluations").verdicts["neither"]
-    nobody = f"; nobody solves {unsolved}" if unsolved else ""
+    found = {cost: against_best(scenes, cost) for cost in COSTS}
+    means = [
+        f"{of.value:.2g} times [{of.low:.2g}, {of.high:.2g}] the {cost}"
+        for cost, each in found.items()
+        if (of := each.mean) is not None
+    ]
+    both = max((each.mean.scenes for each in found.values() if each.mean), default=0)
+    counts = "; ".join(
+        f"{cost} {of['win']} wins, {of['tie']} ties, {of['loss']} losses"
+        for cost, of in ((cost, each.verdicts) for cost, each in found.items())
+    )
+    unsolved = found["evaluations"].verdicts["neither"]
     return (
-        f"Ours over {len(scenes)} scenes and programs, to 99 % of the image error, against the best "
-        f"peer of each: {'; '.join(told)}{nobody}."
+        f"The best peer of each scene takes {' and '.join(means) or 'no known share'} of ours: "
+        f"geometric means over the {both} of {len(scenes)} scenes and programs that both solve, to "
+        f"{SOLVED} % of the image error; {counts}; {unsolved} that nobody solves."
     )

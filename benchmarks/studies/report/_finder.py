@@ -91,7 +91,10 @@ class Answer(NamedTuple):
     def starts(self) -> tuple[int, int, int, int]:
         """From how many starts ours gets there, of how many, and the same for the other."""
         ours, theirs = zip(*(pair.took("evaluations") for pair in self.pairs), strict=True)
-        both = ((sum(of.solved for of in each), sum(of.starts for of in each)) for each in (ours, theirs))
+        both = (
+            (sum(of.solved for of in each), sum(of.starts for of in each))
+            for each in (ours, theirs)
+        )
         (a, b), (c, d) = both
         return a, b, c, d
 

@@ -23,8 +23,9 @@ def by_scene(scenes: Sequence[Scene]) -> Grid:
     for scene in scenes:
         cells = [f"{scene.results['dimensions']:,}", "yes" if scene.plateaus else "no"]
         for cost in COSTS:
-            best = scene.best_peers.get(cost)
-            rival = f"{_median(scene, best, cost)}, {name_of(best)}" if best else "-"
+            best = scene.best_peer(cost)
+            theirs = _median(scene, best, cost)
+            rival = "-" if best is None or theirs == "-" else f"{theirs}, {name_of(best)}"
             cells += [_median(scene, scene.ours, cost), rival]
         rows.append(Row(scene.name, (name_of(scene.ours or "-"), *cells)))
     return Grid(
@@ -61,7 +62,10 @@ def _cells(ran: Sequence[Scene], name: str) -> list[str]:
     for cost in COSTS:
         pairs = ((took(s.ran[s.ours or ""], cost), took(s.ran[name], cost)) for s in ran)
         found = tally(list(pairs))
-        cells += [_mean(found, len(ran)), "/".join(str(found.verdicts[v]) for v in ("win", "tie", "loss"))]
+        cells += [
+            _mean(found, len(ran)),
+            "/".join(str(found.verdicts[v]) for v in ("win", "tie", "loss")),
+        ]
     return cells
 
 
@@ -69,8 +73,8 @@ def _mean(found: Tally, ran: int) -> str:
     of = found.mean
     if of is None:
         return f"- (0/{ran})"
-    interval = f" [{of.low:.2g}, {of.high:.2g}]" if of.count > 1 else ""
-    return f"{of.value:.2g}{interval} ({of.count}/{ran})"
+    interval = f" [{of.low:.2g}, {of.high:.2g}]" if of.scenes > 1 else ""
+    return f"{of.value:.2g}{interval} ({of.scenes}/{ran})"
 
 
 def _median(scene: Scene, method: str | None, cost: str) -> str:

@@ -24,7 +24,7 @@ from benchmarks.studies.report._standing import amount, first, loses
 TEMPLATES = Path(__file__).with_name("templates")
 SIX = 6  # lines that have a name
 NARROW, WIDE = 0.2, 50.0  # the ends of a bar: times as fast
-SCALE = {0.2: "5× worse", 1: "the same", 10: "10×", 50: "50× better"}
+SCALE = {0.2: "5× worse", 1: "1×", 10: "10×", 50: "50× better"}
 WORDS = {"evaluations": ("fewer", "more"), "seconds": ("faster", "slower")}
 
 
@@ -32,16 +32,20 @@ def page(scenes: Sequence[Scene], results: Path, whole: bool) -> str:
     """The page of some scenes; with all that is beside them if it is the `whole`."""
     beside = list(parts(results)) if whole else []
     tables = Part("methods", "All methods together", [Sub("Tables", overall(scenes), open=True)])
-    return _environment().get_template("page.html").render(
-        css=Markup((TEMPLATES / "style.css").read_text()),
-        js=Markup((TEMPLATES / "page.js").read_text()),
-        names=NAMES,
-        finder=finder(scenes),
-        summary=in_one_line(scenes),
-        rule=RULE_TEXT,
-        scenes=[of_scene(scene) for scene in scenes],
-        parts=[tables, *beside],
-        machines=sorted({_machine(scene) for scene in scenes}),
+    return (
+        _environment()
+        .get_template("page.html")
+        .render(
+            css=Markup((TEMPLATES / "style.css").read_text()),
+            js=Markup((TEMPLATES / "page.js").read_text()),
+            names=NAMES,
+            finder=finder(scenes),
+            summary=in_one_line(scenes),
+            rule=RULE_TEXT,
+            scenes=[of_scene(scene) for scene in scenes],
+            parts=[tables, *beside],
+            machines=sorted({_machine(scene) for scene in scenes}),
+        )
     )
 
 
@@ -106,11 +110,11 @@ def _bar(answer: _finder.Answer, cost: str) -> dict[str, Any]:
     times, word = (of.value, better) if of.value >= 1 else (1 / of.value, worse)
     one, at = _place(1), _place(of.value)
     kind = "win" if of.value >= 1 else "lose"
-    on = f"on {of.count} that both solve"
+    on = f"{of.count} scene{'s' * (of.count > 1)}"
     if of.count > 1:
         low, high = _place(of.low), _place(of.high)
         bar |= {"low": low, "span": round(high - low, 1)}
-        on = f"[{of.low:.2g}, {of.high:.2g}] {on}"
+        on = f"[{of.low:.2g}, {of.high:.2g}], {on}"
         kind = "even" if of.low < 1 < of.high else kind
     bar |= {"left": min(one, at), "width": round(abs(at - one), 1), "kind": kind, "interval": on}
     return bar | {"told": f"{times:.2g}× {word}"}
@@ -132,7 +136,7 @@ def of_scene(scene: Scene) -> dict[str, Any]:
         "name": scene.name,
         "title": results["title"],
         "about": _about(scene),
-        "told": _registry.told(scene.entry),
+        "told": _told(scene),
         "notes": results["notes"],
         "remark": results.get("remark", ""),
         "number": _number(scene),
@@ -145,6 +149,7 @@ def of_scene(scene: Scene) -> dict[str, Any]:
         "charts": curves("image_error"),
         "more_charts": curves("parameter_error"),
         "legend": [NAMES[name] for name in named],
+        "more_lines": len(scene.ran) > len(named),
         "table": reached(results),
         "lines": [line for line in (others(results), not_able(results)) if line],
         "command": scene.about["command"],
@@ -152,10 +157,11 @@ def of_scene(scene: Scene) -> dict[str, Any]:
 
 
 def _named(scene: Scene) -> list[str]:
-    """Six: ours, ours where one number is all that is known, and those that come out best."""
-    ours = [scene.ours, scene.with_one_number]
-    known = [name for name in (*ours, *ranked(scene.results)) if name in NAMES]
-    return list(dict.fromkeys(known))[:SIX]
+    """Six: ours, ours where one number is all that is known, the best, and the best peers."""
+    best = ranked(scene.results)
+    peers = [name for name in best if name in scene.peers]
+    known = [scene.ours, scene.with_one_number, best[0], *peers, *best]
+    return list(dict.fromkeys(name for name in known if name in NAMES))[:SIX]
 
 
 def _about(scene: Scene) -> str:
@@ -167,6 +173,13 @@ def _about(scene: Scene) -> str:
         f"ours here is {name_of(scene.ours or 'none')}; {' or '.join(map(str, starts))} starts; at "
         f"most {budget['evaluations']:,} evaluations or {budget['seconds']:g} s a run."
     )
+
+
+def _told(scene: Scene) -> list[str]:
+    """What its module says, beginning with what it says of this one."""
+    said = _registry.told(scene.entry)
+    own = [part for part in said if part.startswith(f"`{scene.name}`")]
+    return own + [part for part in said if part not in own]
 
 
 def _number(scene: Scene) -> str:
@@ -181,10 +194,9 @@ def _number(scene: Scene) -> str:
 
 def _rival(scene: Scene) -> str:
     """The best peer, and how many times as long it takes."""
-    best = scene.best_peers.get("evaluations")
-    if best is None:
+    best = scene.best_peer("evaluations")
+    if best is None or not (theirs := took(scene.ran[best], "evaluations")).reached:
         return "no peer solves it"
-    theirs = took(scene.ran[best], "evaluations")
     times = ratio(took(scene.ran[scene.ours], "evaluations"), theirs) if scene.ours else None
     so = f", {times:.2g}× as many" if times else ""
     return f"{name_of(best)} {amount(theirs.median, 'evaluations')}{so}"

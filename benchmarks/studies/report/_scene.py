@@ -71,16 +71,10 @@ class Scene(NamedTuple):
         """By the rule; None where none of ours was run."""
         return self.with_residuals or self.with_one_number
 
-    @property
-    def best_peers(self) -> dict[str, str]:
-        """By cost, the fastest of those that are not ours, of those that get there at all."""
-        best = {}
-        for cost in ("evaluations", "seconds"):
-            medians = {name: took(self.ran[name], cost).median for name in self.peers}
-            there = {name: median for name, median in medians.items() if median < float("inf")}
-            if there:
-                best[cost] = min(there, key=lambda name: there[name])
-        return best
+    def best_peer(self, cost: str) -> str | None:
+        """The fastest of those that are not ours, even if it gets there from few starts."""
+        costs = {name: took(self.ran[name], cost) for name in self.peers}
+        return min(costs, key=lambda name: costs[name], default=None)
 
 
 def load(name: str, results: Path) -> Iterator[Scene]:

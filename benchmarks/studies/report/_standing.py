@@ -73,7 +73,9 @@ def loses(scene: Scene) -> list[str]:
         mine, theirs = (
             short(100 * scene.ran[name]["final"][ERROR]["median"]) for name in (ours, left[0])
         )
-        said.append(f"At the end: {name_of(left[0])} leaves {theirs} %, ours {mine} %{_more(left)}.")
+        said.append(
+            f"At the end: {name_of(left[0])} leaves {theirs} %, ours {mine} %{_more(left)}."
+        )
     said += _surer(scene, ours)
     return said or ["Nowhere beyond the quartiles, on the way or at the end."]
 
