@@ -26,22 +26,30 @@ def show() -> None:
     """Prints it."""
     console = Console()
     for kind, title in GROUPS.items():
-        shown = Table(title=title, box=None, show_header=False, title_justify="left", pad_edge=True)
-        for name, entry in _registry.tasks().items():
-            if entry.kind == kind:
-                shown.add_row(f"[bold]{name}[/bold]", escape(_traits(entry)), escape(entry.title))
-        if shown.row_count:
-            console.print(shown)
-    shown = Table(title="Methods", box=None, show_header=False, title_justify="left")
-    for method in _registry.methods():
-        shown.add_row(
-            method,
-            f"{name_of(method)}{' (ours)' * is_ours(method)}",
-            escape(_registry.method(method).title),
-        )
-    console.print(shown)
+        rows = [
+            (name, _traits(entry), entry.title.partition(": ")[2] or entry.title)
+            for name, entry in _registry.tasks().items()
+            if entry.kind == kind
+        ]
+        _group(console, title, rows)
+    methods = [(n, f"{name_of(n)}{' (ours)' * is_ours(n)}") for n in _registry.methods()]
+    _group(console, "Methods", methods)
+    console.print()
     for hint in HINTS:
         console.print(hint, highlight=False)
+
+
+def _group(console: Console, title: str, rows: list[tuple[str, ...]]) -> None:
+    """A line for each, which is cut where the terminal is narrow."""
+    if not rows:
+        return
+    console.print(f"\n[bold]{escape(title)}[/bold]", highlight=False)
+    shown = Table(box=None, show_header=False)
+    for _ in rows[0]:
+        shown.add_column(no_wrap=True, overflow="ellipsis")
+    for row in rows:
+        shown.add_row(*map(escape, row))
+    console.print(shown, highlight=False)
 
 
 def _traits(entry: TaskEntry) -> str:

@@ -31,8 +31,9 @@ class Took(NamedTuple):
 def took(found: dict[str, Any], cost: str, level: str = SOLVED, error: str = ERROR) -> Took:
     """What a method took to a level, by its part of the results."""
     level_of = found["took"][error][level]
-    three = (math.inf if (q := level_of[cost][name]) is None else q for name in Took._fields[:3])
-    return Took(*three, level_of["solved"], found["starts"])
+    quartile = lambda name: math.inf if (q := level_of[cost][name]) is None else q
+    median, lower, upper = quartile("median"), quartile("lower"), quartile("upper")
+    return Took(median, lower, upper, level_of["solved"], found["starts"])
 
 
 def ranked(task: dict[str, Any]) -> list[str]:
@@ -42,8 +43,8 @@ def ranked(task: dict[str, Any]) -> list[str]:
     def place(name: str) -> tuple[float, float, float]:
         found = methods[name]
         left = found["final"][ERROR]["median"]
-        costs = (took(found, "evaluations", level).median for level in (SOLVED, ENTERED))
-        return *costs, math.inf if left is None else left
+        solved, entered = (took(found, "evaluations", each).median for each in (SOLVED, ENTERED))
+        return solved, entered, math.inf if left is None else left
 
     return sorted(methods, key=place)
 

@@ -1,4 +1,4 @@
-"""What the first screen answers: against what I use now, on my kind of problem, how fast is ours?"""
+"""What the first screen answers: how fast is ours, against what I use, on my kind of problem?"""
 
 from collections.abc import Iterator, Sequence
 from itertools import product

@@ -110,8 +110,8 @@ def _bar(answer: _finder.Answer, cost: str) -> dict[str, Any]:
     times, word = (of.value, better) if of.value >= 1 else (1 / of.value, worse)
     one, at = _place(1), _place(of.value)
     kind = "win" if of.value >= 1 else "lose"
-    on = f"{of.count} scene{'s' * (of.count > 1)}"
-    if of.count > 1:
+    on = f"{of.scenes} scene{'s' * (of.scenes > 1)}"
+    if of.scenes > 1:
         low, high = _place(of.low), _place(of.high)
         bar |= {"low": low, "span": round(high - low, 1)}
         on = f"[{of.low:.2g}, {of.high:.2g}], {on}"
