@@ -10,10 +10,9 @@ from tqdm import tqdm
 
 from benchmarks import _atlas, _loop, _registry
 from benchmarks._pictures import draw
-from benchmarks._reached import ending
 from benchmarks._study import setting
 from benchmarks._summary import summarise
-from benchmarks._tables import compare, tables
+from benchmarks._tables import compare, ending, tables
 from benchmarks._task import Method, NotAble, Problem, Solve, precision_of
 
 __all__ = ["compare", "draw", "ending", "forgiving", "measure", "tables", "usual"]

@@ -17,8 +17,10 @@ GROUPS: dict[Kind, str] = {
     "descent": "Problems that come with gradients, for filters of them",
 }
 HINTS = (
-    "One task: python -m benchmarks run occlusion; all scenes: python -m benchmarks run all.",
-    "The page of what is committed: python -m benchmarks report. All commands: --help.",
+    "Run one: python -m benchmarks run occlusion",
+    "Run all scenes: python -m benchmarks run all",
+    "The page of what is committed: python -m benchmarks report",
+    "All commands: python -m benchmarks --help",
 )
 
 
@@ -45,8 +47,10 @@ def _group(console: Console, title: str, rows: list[tuple[str, ...]]) -> None:
         return
     console.print(f"\n[bold]{escape(title)}[/bold]", highlight=False)
     shown = Table(box=None, show_header=False)
-    for _ in rows[0]:
-        shown.add_column(no_wrap=True, overflow="ellipsis")
+    *facts, _ = zip(*rows, strict=True)
+    for column in facts:
+        shown.add_column(no_wrap=True, min_width=max(map(len, column)))
+    shown.add_column(no_wrap=True, overflow="ellipsis")
     for row in rows:
         shown.add_row(*map(escape, row))
     console.print(shown, highlight=False)

@@ -58,7 +58,7 @@ OTHERS = {
     "annealing": Named("Simulated annealing", "#7A8896", DASHED),
     "genetic_algorithm": Named("Genetic algorithm", "#9A86C4", DOTTED),
     "evosax_snes": Named("SNES", "#4A90C2", DOTTED),
-    "bfgs": Named("BFGS", "#4D8076", MIXED),
+    "bfgs": Named("BFGS", "#4D8076", DASHED),
     "optimistix_bfgs": Named("BFGS on differences", "#4D8076", MIXED),
     "jaxopt_lbfgs": Named("L-BFGS, smoothed", "#4D8076", DOTTED),
     "optax_perturbations": Named("optax.perturbations", "#8F6FB0", DASHED),

@@ -10,7 +10,6 @@ from benchmarks._summary import REDUCTIONS, able
 ERROR = "image_error"
 SOLVED = "99"  # percent: what counts as solved
 ENTERED = "90"  # percent: who gets as far is in the table
-MARK = "» "  # before what is ours, as a terminal may have no bold
 
 
 class Took(NamedTuple):
@@ -110,18 +109,6 @@ def not_able(task: dict[str, Any]) -> str:
         if "not_able" in found
     }
     return " ".join(f"{who} is not able here: {why}." for who, why in reasons.items())
-
-
-def ending(results: dict[str, Any]) -> tuple[list[Grid], list[str]]:
-    """What a run ends with: the tables of those that got there, ours marked, and a few lines."""
-    grids, lines = [], []
-    for task in filter(able, results["tasks"].values()):
-        grid = reached(task)
-        rows = (row._replace(name=MARK * row.strong + row.name) for row in grid.rows)
-        grids.append(grid._replace(rows=tuple(rows)))
-        lines.append(others(task))
-    lines += [not_able(task) for task in results["tasks"].values()]
-    return grids, list(dict.fromkeys(filter(None, lines)))
 
 
 def _count(level: dict[str, Any], cost: str, with_quartiles: bool) -> str:

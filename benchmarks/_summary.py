@@ -62,7 +62,8 @@ def took(runs: list[Run], error: str, level: float) -> dict[str, Any]:
     """From how many starts a level is reached, and quartiles of what that costs."""
     costs = {cost: [cost_to_level(run[error], run[cost], level) for run in runs] for cost in COSTS}
     solved = sum(math.isfinite(cost) for cost in costs["evaluations"])
-    return {"solved": solved} | {cost: quartiles(values) for cost, values in costs.items()}
+    found = {cost: quartiles(values) | without_one(values) for cost, values in costs.items()}
+    return {"solved": solved} | found
 
 
 def curve(runs: list[Run], error: str, cost: str) -> dict[str, Any]:
@@ -95,6 +96,16 @@ def quartiles(values: Sequence[float]) -> dict[str, float | None]:
     three = np.quantile(values, [0.5, 0.25, 0.75], method="higher")
     found = [float(q) if math.isfinite(q) else None for q in three]
     return dict(zip(("median", "lower", "upper"), found, strict=True))
+
+
+def without_one(values: Sequence[float]) -> dict[str, float | None]:
+    """The least and the most that the median is when any one of the values is left out."""
+    if len(values) < 2:
+        return {}
+    left = (quartiles([*values[:i], *values[i + 1 :]])["median"] for i in range(len(values)))
+    medians = sorted(math.inf if median is None else median for median in left)
+    ends = zip(("least", "most"), (medians[0], medians[-1]), strict=True)
+    return {name: value if math.isfinite(value) else None for name, value in ends}
 
 
 def quarters(values: Any) -> list[Any]:

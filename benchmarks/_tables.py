@@ -7,7 +7,7 @@ from typing import Any
 from benchmarks._grid import Grid, Row, short, spread
 from benchmarks._names import name_of
 from benchmarks._pictures import GAP, errors_of, names_of
-from benchmarks._reached import not_able
+from benchmarks._reached import not_able, others, reached
 from benchmarks._summary import COSTS, able
 
 CAPTIONS = {
@@ -15,6 +15,7 @@ CAPTIONS = {
     "parameter_error": "Seconds are without compilation.",
     "gap": "It is absolute.",
 }
+MARK = "» "  # before what is ours, as a terminal may have no bold
 COMPARED = "99"  # percent: the level at which runs are put beside the committed ones
 
 
@@ -26,6 +27,20 @@ def tables(results: dict[str, Any]) -> Iterator[Grid]:
         yield _left(task)
     if len(results["tasks"]) > 1:
         yield _family(results)
+
+
+def ending(results: dict[str, Any]) -> tuple[list[Grid], list[str]]:
+    """What a run ends with: the tables of those that got there, ours marked, and a few lines."""
+    grids, lines = [], []
+    for task in filter(able, results["tasks"].values()):
+        grid = reached(task)
+        rows = (row._replace(name=MARK * row.strong + row.name) for row in grid.rows)
+        grids.append(grid._replace(rows=tuple(rows)))
+        lines.append(others(task))
+    if len(grids) > 1:
+        grids.append(_family(results))
+    lines += [not_able(task) for task in results["tasks"].values()]
+    return grids, list(dict.fromkeys(filter(None, lines)))
 
 
 def _took(task: dict[str, Any], error: str) -> Grid:

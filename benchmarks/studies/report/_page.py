@@ -25,6 +25,7 @@ TEMPLATES = Path(__file__).with_name("templates")
 SIX = 6  # lines that have a name
 NARROW, WIDE = 0.2, 50.0  # the ends of a bar: times as fast
 SCALE = {0.2: "5× worse", 1: "1×", 10: "10×", 50: "50× better"}
+IN_PROFILES = ("cma-es", "bobyqa", "dfo-ls", "nelder-mead")  # peers
 WORDS = {"evaluations": ("fewer", "more"), "seconds": ("faster", "slower")}
 
 
@@ -39,7 +40,7 @@ def page(scenes: Sequence[Scene], results: Path, whole: bool) -> str:
             css=Markup((TEMPLATES / "style.css").read_text()),
             js=Markup((TEMPLATES / "page.js").read_text()),
             names=NAMES,
-            finder=finder(scenes),
+            finder=finder(scenes, {part.key for part in beside}),
             summary=in_one_line(scenes),
             rule=RULE_TEXT,
             scenes=[of_scene(scene) for scene in scenes],
@@ -58,8 +59,8 @@ def _environment() -> jinja2.Environment:
     )
 
 
-def finder(scenes: Sequence[Scene]) -> dict[str, Any]:
-    """What the first screen asks, and all its answers."""
+def finder(scenes: Sequence[Scene], beside: set[str]) -> dict[str, Any]:
+    """What the first screen asks, and all its answers; `beside` are the parts of the page."""
     size = {
         "key": "size",
         "asks": "My problem has",
@@ -68,14 +69,14 @@ def finder(scenes: Sequence[Scene]) -> dict[str, Any]:
     }
     plateaus = {"key": "plateaus", "asks": "with", "choices": _finder.PLATEAUS.items(), "ends": ""}
     seen = {"key": "seen", "asks": "and gives", "choices": _finder.SEEN.items(), "ends": ""}
-    found = [_answer(answer) for answer in _finder.answers(scenes)]
+    found = [_answer(answer, "profiles" in beside) for answer in _finder.answers(scenes)]
     scale = [(_place(times), label) for times, label in SCALE.items()]
     groups = [size, plateaus, seen]
     asked = {"peers": _finder.PEERS, "groups": groups, "answers": found}
     return asked | {"one": _place(1), "scale": scale}
 
 
-def _answer(answer: _finder.Answer) -> dict[str, Any]:
+def _answer(answer: _finder.Answer, profiles: bool) -> dict[str, Any]:
     plateaus, seen = _finder.PLATEAUS[answer.plateaus], _finder.SEEN[answer.seen]
     told: dict[str, Any] = {
         "key": answer.key,
@@ -83,7 +84,7 @@ def _answer(answer: _finder.Answer) -> dict[str, Any]:
         "asked": f"{answer.size.name} parameters, {plateaus}, {seen}",
     }
     if not answer.pairs:
-        see = "profiles" if answer.peer.key in ("bobyqa", "dfo-ls") else ""
+        see = profiles and answer.peer.key in IN_PROFILES
         return told | {"bars": [], "why_none": answer.why_none, "see": see}
     count, (ours, theirs) = len(answer.pairs), answer.solved
     a, b, c, d = answer.starts
