@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks._atlas import stored
+from benchmarks._atlas import frames, stored
 from benchmarks._grid import short
-from benchmarks._names import is_ours, name_of
+from benchmarks._names import NAMES, is_ours, name_of
 from benchmarks._style import CROWDED, band, figure, headed, legend, looks, panels
 from benchmarks._summary import COSTS, GAPS, LEVELS, able, grid
 
@@ -39,6 +39,8 @@ def draw(results: dict[str, Any], folder: Path) -> None:
         for cost in COSTS if _has_curves(task) else ():
             _curves(task, cost, into / FILES[cost])
         _images(task, into / "images.png")
+        if task.get("film"):
+            _film(task, into / "film.png")
     if len(tasks) > 1 and all("gap" in errors_of(task) for task in tasks.values()):
         _family(results, folder / "evaluations.png")
 
@@ -124,6 +126,32 @@ def _images(task: dict[str, Any], path: Path) -> None:
             axis.imshow(picture, interpolation="nearest")
             axis.set_xlabel(f"error {error}")
             axis.set_title(fill(name, 20), fontsize=8, loc="center")
+
+
+def _film(task: dict[str, Any], path: Path) -> None:
+    """A line for each method, what it had found after some evaluations, beside start and goal."""
+    film, methods = task["film"], able(task)
+    pictures = stored(task, list(methods))
+    assert pictures is not None
+    lines = {name: each for name, each in frames(film).items() if name in methods}
+    heads = ["Start", *(f"{mark} renders" for mark in film["marks"]), "Reference"]
+    wide = SQUARE * pictures.start.shape[1] / pictures.start.shape[0]
+    size = wide * len(heads) + 1.2, (SQUARE + 0.25) * len(lines) + 0.4
+    with figure(path, len(lines), len(heads), size) as (_, axes):
+        for line, (name, found) in zip(axes, lines.items(), strict=True):
+            shown = [pictures.start, *found, pictures.reference]
+            errors = [1.0, *film["errors"][name], 0.0]
+            for axis, picture, error in zip(line, shown, errors, strict=True):
+                axis.imshow(picture, interpolation="nearest")
+                axis.set(xticks=[], yticks=[])
+                axis.spines[:].set_visible(False)
+                axis.set_xlabel(f"{short(100 * error)} % left", fontsize=8)
+            line[0].set_xlabel("")
+            line[-1].set_xlabel("")
+            weight = "bold" if is_ours(name) else "normal"
+            line[0].set_ylabel(name_of(name), weight=weight, color=NAMES[name].colour)
+        for axis, head in zip(axes[0], heads, strict=True):
+            axis.set_title(head, loc="center")
 
 
 def _family(results: dict[str, Any], path: Path) -> None:

@@ -25,7 +25,7 @@ def tables(results: dict[str, Any]) -> Iterator[Grid]:
         for error in errors_of(task):
             yield _took(task, error)
         yield _left(task)
-    if len(results["tasks"]) > 1:
+    if _compared_by_gap(results):
         yield _family(results)
 
 
@@ -37,7 +37,7 @@ def ending(results: dict[str, Any]) -> tuple[list[Grid], list[str]]:
         rows = (row._replace(name=MARK * row.strong + row.name) for row in grid.rows)
         grids.append(grid._replace(rows=tuple(rows)))
         lines.append(others(task))
-    if len(grids) > 1:
+    if _compared_by_gap(results):
         grids.append(_family(results))
     lines += [not_able(task) for task in results["tasks"].values()]
     return grids, list(dict.fromkeys(filter(None, lines)))
@@ -75,6 +75,12 @@ def _left(task: dict[str, Any]) -> Grid:
         columns=("method", "image error", "parameter error", "distance", "compile"),
         rows=tuple(rows),
     )
+
+
+def _compared_by_gap(results: dict[str, Any]) -> bool:
+    """Whether it is a family whose lowest values are known."""
+    tasks = results["tasks"].values()
+    return len(tasks) > 1 and all("gap" in errors_of(task) for task in tasks)
 
 
 def _family(results: dict[str, Any]) -> Grid:

@@ -145,6 +145,7 @@ def of_scene(scene: Scene) -> dict[str, Any]:
         "cards": [pictures[k] for k in ("Start", scene.ours, "Reference") if k in pictures],
         "pictures": [pictures[k] for k in ("Reference", "Start", *named) if k in pictures],
         "more_pictures": [shown for key, shown in pictures.items() if key not in chosen],
+        "film": _film(scene),
         "standing": [first(scene, cost) for cost in COSTS],
         "loses": loses(scene),
         "charts": curves("image_error"),
@@ -217,6 +218,26 @@ def _pictures(scene: Scene) -> dict[str, dict[str, str]]:
         caption = f"{name_of(name, scene.ran[name]['title'])}: {left} % left"
         found[name] = {"uri": uri(picture), "away": uri(away[name]), "caption": caption}
     return found
+
+
+def _film(scene: Scene) -> list[dict[str, Any]]:
+    """What some methods had found after so many renders, a line for each."""
+    shot = scene.results.get("film")
+    if not shot:
+        return []
+    lines = []
+    for name, pictures in _atlas.frames(shot).items():
+        each = zip(shot["marks"], pictures, shot["errors"][name], strict=True)
+        frames = [
+            {
+                "uri": _atlas.data_uri(_atlas.png(picture)),
+                "away": "",
+                "caption": f"{name_of(name)} after {mark}: {short(100 * error)} % left",
+            }
+            for mark, picture, error in each
+        ]
+        lines.append({"name": name_of(name), "frames": frames})
+    return lines
 
 
 def _machine(scene: Scene) -> str:
