@@ -47,7 +47,7 @@ def to_rich(grid: Grid) -> Table:
         caption=escape_markup(grid.caption),
         box=box.SIMPLE_HEAD,
     )
-    shown.add_column(grid.columns[0])
+    shown.add_column(grid.columns[0], overflow="fold")
     for column in grid.columns[1:]:
         shown.add_column(column, justify="right" if grid.numbers else "left")
     for row in grid.rows:

@@ -55,34 +55,38 @@ def entered(task: dict[str, Any]) -> tuple[list[str], list[str]]:
     return [n for n in names if there[n]], [n for n in names if not there[n]]
 
 
-def reached(task: dict[str, Any]) -> Grid:
-    """Of those that got there, what they took to each level, and what they left."""
+def reached(task: dict[str, Any], brief: bool = False) -> Grid:
+    """Of those that got there, what they took to each level, and what they left.
+
+    In brief it fits into 80 columns.
+    """
     methods, budget = able(task), task["budget"]
     rows = []
     for name in entered(task)[0]:
         found = methods[name]
-        levels = found["took"][ERROR]
-        solved = f"{levels[SOLVED]['solved']}/{found['starts']}"
-        counts = (_count(levels[level], "evaluations", level == SOLVED) for level in REDUCTIONS)
-        parameters = _count(found["took"]["parameter_error"][SOLVED], "evaluations", False)
-        seconds = _count(levels[SOLVED], "seconds", True)
-        left = f"{short(_percent(found['final'][ERROR]['median']))} %"
-        cells = (solved, *counts, seconds, parameters, left)
-        rows.append(Row(name_of(name, found["title"]), cells, name, is_ours(name)))
+        levels, parameters = found["took"][ERROR], found["took"]["parameter_error"][SOLVED]
+        shown = {"solved": f"{levels[SOLVED]['solved']}/{found['starts']}"}
+        for level in REDUCTIONS:
+            took_so_many = levels[level]["evaluations"]
+            median = short(took_so_many["median"])
+            shown[f"{level} %"] = spread(took_so_many) if level == SOLVED else median
+        seconds = levels[SOLVED]["seconds"]
+        shown["seconds"] = short(seconds["median"]) if brief else spread(seconds)
+        if not brief:
+            shown["parameters"] = short(parameters["evaluations"]["median"])
+        shown["left, %"] = short(_percent(found["final"][ERROR]["median"]))
+        rows.append((name, shown))
+    limit = f"At most {budget['evaluations']:,} evaluations or {budget['seconds']:g} s a run."
+    parameters = "" if brief else " Parameters: evaluations to 99 % of their error."
     return Grid(
-        title=f"{task['title']}: evaluations, and who got there",
-        caption=f"Medians [quartiles] over the starts, to 90, 99 and 99.9 % of the image error, at "
-        f"most {budget['evaluations']:,} evaluations or {budget['seconds']:g} s a run. "
-        "- is no more than half of the starts.",
-        columns=(
-            "method",
-            "99 % from",
-            *(f"to {level} %" for level in REDUCTIONS),
-            "s to 99 %",
-            "parameters 99 %",
-            "left",
+        title=f"{task['title']}: evaluations to 90, 99 and 99.9 % of the image error",
+        caption=f"Medians [quartiles] over the starts; - is no more than half of them. Seconds are "
+        f"to 99 %.{parameters} {limit}",
+        columns=("method", *(rows[0][1] if rows else ())),
+        rows=tuple(
+            Row(name_of(name, methods[name]["title"]), tuple(shown.values()), name, is_ours(name))
+            for name, shown in rows
         ),
-        rows=tuple(rows),
     )
 
 
@@ -109,10 +113,6 @@ def not_able(task: dict[str, Any]) -> str:
         if "not_able" in found
     }
     return " ".join(f"{who} is not able here: {why}." for who, why in reasons.items())
-
-
-def _count(level: dict[str, Any], cost: str, with_quartiles: bool) -> str:
-    return spread(level[cost]) if with_quartiles else short(level[cost]["median"])
 
 
 def _percent(share: float | None) -> float | None:

@@ -33,7 +33,7 @@ def ending(results: dict[str, Any]) -> tuple[list[Grid], list[str]]:
     """What a run ends with: the tables of those that got there, ours marked, and a few lines."""
     grids, lines = [], []
     for task in filter(able, results["tasks"].values()):
-        grid = reached(task)
+        grid = reached(task, brief=True)
         rows = (row._replace(name=MARK * row.strong + row.name) for row in grid.rows)
         grids.append(grid._replace(rows=tuple(rows)))
         lines.append(others(task))

@@ -50,7 +50,7 @@ def of_scene(found, dimensions=2):
 def scene(name="shadow", dimensions=2, plateaus=True, **found):
     """A scene; a step of so many evaluations takes a tenth of the error that is left."""
     entry = TaskEntry(TITLE, "scene", build, Traits((dimensions,), plateaus))
-    return Scene(name, of_scene(found, dimensions), ABOUT, entry)
+    return Scene(name, of_scene(found, dimensions), ABOUT, entry, name)
 
 
 def never(scene, method, *costs):

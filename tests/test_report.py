@@ -7,10 +7,10 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from made_scenes import ABOUT, never, of_scene, run_of, scene
-from stripes import SIDE, TITLE, build, registered
+from stripes import REFERENCE, SIDE, TITLE, build, registered
 
 from benchmarks import __main__ as cli
-from benchmarks import _atlas, _registry, _study, _tables
+from benchmarks import _atlas, _pictures, _registry, _study, _tables
 from benchmarks._names import NAMES, OURS
 from benchmarks._reached import Took, took
 from benchmarks._summary import without_one
@@ -187,7 +187,8 @@ def test_the_table_of_those_that_got_there():
     made = never(scene(gauss_newton=2, fr22=9, spsa=3, mitsuba_ad="no LLVM"), "spsa")
     (grid,), lines = _tables.ending({"tasks": {"shadow": made.results}})
     assert [row.name for row in grid.rows] == ["» GaussNewton", "Fischer-FR22"]
-    assert grid.rows[0].cells == ("2/2", "2", "4", "6", "0.4", "4", "0.001 %")
+    assert grid.columns[1:] == ("solved", "90 %", "99 %", "99.9 %", "seconds", "left, %")
+    assert grid.rows[0].cells == ("2/2", "2", "4", "6", "0.4", "0.001")
     assert lines[0].startswith("Not to 90 % from more than half of the starts")
     assert "SPSA (0.001 %)" in lines[0]
     assert lines[1] == "Mitsuba AD, Adam is not able here: no LLVM."
@@ -230,6 +231,24 @@ def test_pictures_are_those_of_the_first_start():
     assert _atlas.stored(of_scene({"fr22": 2}), ["fr22"]) is None
 
 
+def test_a_film_has_what_was_found_within_so_many_evaluations(tmp_path):
+    at = {f"found {mark}": np.asarray(REFERENCE) * mark / 40 for mark in _atlas.MARKS}
+    method = lambda name: Method(name, name, lambda problem: None, "")  # type: ignore[arg-type]
+    runs = {method(name): [run_of(0, 10, step) | at] for name, step in (("fr22", 15), ("spsa", 2))}
+    shot = _atlas.film(build(full=False), runs)
+    assert shot is not None
+    # a step is 15 evaluations: none is done after 10, one after 20, two after 40
+    assert shot["errors"] == {"fr22": [1.0, 0.1, pytest.approx(0.01)]}
+    _, half, whole = _atlas.frames(shot)["fr22"]
+    sought = _atlas.display(build(full=False).score.image(REFERENCE))
+    assert whole == pytest.approx(sought, abs=1 / 255)
+    assert np.all(half < whole)
+    results = of_scene({"fr22": 15, "spsa": 2})
+    results |= {"pictures": _atlas.rendered(build(full=False), runs), "film": shot}
+    _pictures.draw({"tasks": {"stripes": results}}, tmp_path)
+    assert (tmp_path / "film.png").read_bytes().startswith(b"\x89PNG")
+
+
 class Page(HTMLParser):
     """Checks that what is opened is closed, and gathers what the page points to."""
 
@@ -264,8 +283,10 @@ def test_the_page_needs_no_other_file_and_says_what_the_terminal_says(
     found = {"gauss_newton": 2, "fr22": 9, "our_hvpa": 5, "mitsuba_ad": "no <LLVM>"}
     results = of_scene(found) | {"remark": "Lost & <found>."}
     method = lambda name: Method(name, name, lambda problem: None, "")  # type: ignore[arg-type]
-    runs = {method(name): [run_of(0, 10, 2)] for name in ("gauss_newton", "fr22", "our_hvpa")}
-    results["pictures"] = _atlas.rendered(build(full=False), runs)
+    run = run_of(0, 10, 2) | {f"found {mark}": np.asarray(REFERENCE) for mark in _atlas.MARKS}
+    runs = {method(name): [run] for name in ("gauss_newton", "fr22", "our_hvpa")}
+    task = build(full=False)
+    results |= {"pictures": _atlas.rendered(task, runs), "film": _atlas.film(task, runs)}
     _study.write(ABOUT | {"title": TITLE, "tasks": {"stripes": results}}, tmp_path / "stripes")
     cli.main(["report", "stripes", "shadow", "--runs"], tmp_path)
     printed = " ".join(capsys.readouterr().out.split())
@@ -279,8 +300,10 @@ def test_the_page_needs_no_other_file_and_says_what_the_terminal_says(
     assert len({*page.ids}) == len(page.ids)
     inside = {f"#{name}" for name in page.ids}
     assert all(link.startswith("data:image/png;base64,") or link in inside for link in page.links)
-    # start, found by three, and how far each is away; the reference; three of them in the grid
-    assert sum(link.startswith("data:") for link in page.links) == 2 * 4 + 1 + 3
+    # start, found by three, and how far each is away; the reference; three of them in the grid;
+    # two methods in a film
+    films = 2 * len(_atlas.MARKS)
+    assert sum(link.startswith("data:") for link in page.links) == 2 * 4 + 1 + 3 + films
     told = " ".join(" ".join(page.texts).split())
     for text in ("Lost & <found>.", "no <LLVM>", "few <pixels>", "a <CPU>", "A task of the tests"):
         assert text in told

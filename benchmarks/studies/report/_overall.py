@@ -27,7 +27,7 @@ def by_scene(scenes: Sequence[Scene]) -> Grid:
             theirs = _median(scene, best, cost)
             rival = "-" if best is None or theirs == "-" else f"{theirs}, {name_of(best)}"
             cells += [_median(scene, scene.ours, cost), rival]
-        rows.append(Row(scene.name, (name_of(scene.ours or "-"), *cells)))
+        rows.append(Row(scene.label, (name_of(scene.ours or "-"), *cells)))
     return Grid(
         title="The scenes, to 99 % of the image error",
         caption="Medians; - is no more than half of the starts. The best peer is chosen for each.",

@@ -1,13 +1,14 @@
 """The page: HTML with everything in it, made by templates from results; it needs no other file."""
 
 import math
+import re
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import jinja2
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from benchmarks import _atlas, _registry
 from benchmarks._grid import short
@@ -54,9 +55,16 @@ def page(scenes: Sequence[Scene], results: Path, whole: bool) -> str:
 def _environment() -> jinja2.Environment:
     loader = jinja2.FileSystemLoader(TEMPLATES)
     strict: Any = jinja2.StrictUndefined
-    return jinja2.Environment(
+    made = jinja2.Environment(
         loader=loader, autoescape=True, undefined=strict, trim_blocks=True, lstrip_blocks=True
     )
+    made.filters["code"] = _code
+    return made
+
+
+def _code(text: str) -> Markup:
+    """What stands between backticks, as code."""
+    return Markup(re.sub(r"`([^`]*)`", r"<code>\1</code>", str(escape(text))))
 
 
 def finder(scenes: Sequence[Scene], beside: set[str]) -> dict[str, Any]:
@@ -94,7 +102,7 @@ def _answer(answer: _finder.Answer, profiles: bool) -> dict[str, Any]:
         "bars": [_bar(answer, cost) for cost in COSTS],
         "solved": f"Solved: {answer.ours} {ours} of {count} ({a} of {b} starts), "
         f"{answer.peer.name} {theirs} of {count} ({c} of {d}).",
-        "scenes": [pair.scene.name for pair in answer.pairs],
+        "scenes": [(pair.scene.name, pair.scene.label) for pair in answer.pairs],
     }
 
 
@@ -135,6 +143,7 @@ def of_scene(scene: Scene) -> dict[str, Any]:
     curves = lambda error: [chart for chart in drawn(error) if chart is not None]
     return {
         "name": scene.name,
+        "label": scene.label,
         "title": results["title"],
         "about": _about(scene),
         "told": _told(scene),
@@ -180,7 +189,7 @@ def _about(scene: Scene) -> str:
 def _told(scene: Scene) -> list[str]:
     """What its module says, beginning with what it says of this one."""
     said = _registry.told(scene.entry)
-    own = [part for part in said if part.startswith(f"`{scene.name}`")]
+    own = [part for part in said if part.startswith(f"`{scene.task}`")]
     return own + [part for part in said if part not in own]
 
 

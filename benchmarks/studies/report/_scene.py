@@ -38,6 +38,12 @@ class Scene(NamedTuple):
     results: dict[str, Any]
     about: dict[str, Any]
     entry: TaskEntry
+    task: str  # the name on the command line
+
+    @property
+    def label(self) -> str:
+        """The name, with that of the family where it does not tell."""
+        return self.name if self.name.startswith(self.task) else f"{self.task}, {self.name}"
 
     @property
     def ran(self) -> dict[str, Any]:
@@ -84,6 +90,6 @@ def load(name: str, results: Path) -> Iterator[Scene]:
         return
     tasks = found.pop("tasks")
     for member, task in tasks.items():
-        scene = Scene(member, task, found, _registry.task(name))
+        scene = Scene(member, task, found, _registry.task(name), name)
         if scene.ran:
             yield scene
