@@ -46,8 +46,9 @@ def to_rich(grid: Grid) -> Table:
         title=escape_markup(grid.title),
         caption=escape_markup(grid.caption),
         box=box.SIMPLE_HEAD,
+        collapse_padding=True,
     )
-    shown.add_column(grid.columns[0], overflow="fold")
+    shown.add_column(grid.columns[0], no_wrap=True)
     for column in grid.columns[1:]:
         shown.add_column(column, justify="right" if grid.numbers else "left")
     for row in grid.rows:
