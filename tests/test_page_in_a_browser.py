@@ -82,6 +82,7 @@ def test_a_choice_changes_the_answer_and_can_be_sent_as_a_link(opened, page):
     assert opened.ask("return location.hash") == f"#{chosen}"
     opened.open(page, 1400, 900, at="#fr22-many-smooth-number")
     assert opened.ask(SHOWN) == ["fr22-many-smooth-number"]
+    assert opened.ask("return scrollY") == 0  # the questions are above it
 
 
 def test_without_javascript_links_lead_to_the_answers(opened, page):

@@ -178,6 +178,10 @@ def test_each_task_answers_one_question_for_each_peer_that_ran():
     of = many.tally("evaluations").mean
     assert of is not None
     assert of.value == pytest.approx(3)
+    assert not many.close("evaluations")
+    near = [scene("d", newton_cg=(2, 5), cma_es=(3, 4))]
+    (only,) = (each for each in _finder.answers(near) if each.pairs)
+    assert only.close("seconds")
     assert many.solved == (1, 1)
     assert many.starts == (2, 2, 2, 2)
     assert "needs residuals" in found["dfo-ls-few-plateaus-number"].why_none

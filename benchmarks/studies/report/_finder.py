@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from benchmarks._names import name_of
 from benchmarks._reached import Took, took
-from benchmarks.studies.report._compare import Tally, tally
+from benchmarks.studies.report._compare import Tally, ratio, tally, verdict
 from benchmarks.studies.report._scene import Scene
 
 
@@ -80,6 +80,11 @@ class Answer(NamedTuple):
     def tally(self, cost: str) -> Tally:
         """What came out over the scenes."""
         return tally([pair.took(cost) for pair in self.pairs])
+
+    def close(self, cost: str) -> bool:
+        """Whether the quartiles overlap on the only scene that both solve."""
+        pairs = [pair.took(cost) for pair in self.pairs]
+        return [verdict(*pair) for pair in pairs if ratio(*pair) is not None] == ["tie"]
 
     @property
     def solved(self) -> tuple[int, int]:

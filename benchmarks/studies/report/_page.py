@@ -125,6 +125,8 @@ def _bar(answer: _finder.Answer, cost: str) -> dict[str, Any]:
         bar |= {"low": low, "span": round(high - low, 1)}
         on = f"[{of.low:.2g}, {of.high:.2g}], {on}"
         kind = "even" if of.low < 1 < of.high else kind
+    elif answer.close(cost):
+        kind, on = "even", f"{on}, quartiles overlap"
     bar |= {"left": min(one, at), "width": round(abs(at - one), 1), "kind": kind, "interval": on}
     return bar | {"told": f"{times:.2g}× {word}"}
 
