@@ -1,4 +1,4 @@
-"""The command line: `python -m benchmarks list | run TASK... | draw NAME... | overhead | ...`."""
+"""The command line: `python -m benchmarks [list] | run TASK... | draw NAME... | report | ...`."""
 
 import argparse
 import sys
@@ -8,11 +8,11 @@ from types import ModuleType
 
 import jax
 from rich.console import Console
-from rich.table import Table
 from tqdm import tqdm
 
-from benchmarks import _black_boxes, _descents, _registry, _study
+from benchmarks import _black_boxes, _descents, _listing, _registry, _study
 from benchmarks._task import NotAble
+from benchmarks.studies import report
 
 STARTS = {False: 5, True: 20}  # of most scenes, quick and full: a guess, for the bar only
 FLAGS: dict[str, dict] = {
@@ -28,8 +28,8 @@ FLAGS: dict[str, dict] = {
 def parser() -> argparse.ArgumentParser:
     """What can be said on the command line."""
     said = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    commands = said.add_subparsers(dest="command", required=True)
-    commands.add_parser("list", help="name the tasks and the methods")
+    commands = said.add_subparsers(dest="command")
+    commands.add_parser("list", help="name the tasks and the methods; the same as nothing")
     run = commands.add_parser("run", help="run methods on tasks; what has been run is kept")
     names = [*_registry.tasks(), "all"]
     run.add_argument("names", nargs="+", metavar="TASK", choices=names, help="or all: the scenes")
@@ -54,8 +54,8 @@ def main(arguments: list[str] | None = None, runs: Path = _study.RUNS) -> None:
     arguments = sys.argv[1:] if arguments is None else arguments
     options = parser().parse_args(arguments)
     options.said = " ".join(["python -m benchmarks", *arguments])
-    if options.command == "list":
-        _list()
+    if options.command in (None, "list"):
+        _listing.show()
     elif options.command == "run":
         if "all" in options.names:
             _run_scenes(options, runs)
@@ -63,7 +63,8 @@ def main(arguments: list[str] | None = None, runs: Path = _study.RUNS) -> None:
             try:
                 _run(name, options, runs / name)
             except NotAble as reason:
-                Console().print(f"{name} is not able here: {reason}.")
+                Console().print(f"{name} is not able here: {reason}.", markup=False)
+        _page(options.names, runs)
     elif options.command == "draw":
         for name in options.names:
             _draw(name, runs / name)
@@ -71,15 +72,6 @@ def main(arguments: list[str] | None = None, runs: Path = _study.RUNS) -> None:
         study = _registry.studies()[options.command]
         run = getattr(study, "run", partial(_study.run, study))
         run(options, runs / options.command)
-
-
-def _list() -> None:
-    methods = {name: _registry.method(name) for name in _registry.methods()}
-    for title, entries in (("Tasks", _registry.tasks()), ("Methods", methods)):
-        shown = Table(title=title, show_header=False, title_justify="left")
-        for name, entry in entries.items():
-            shown.add_row(name, entry.title)
-        Console().print(shown)
 
 
 def _study_of(name: str) -> ModuleType:
@@ -112,7 +104,15 @@ def _run_scenes(options: argparse.Namespace, runs: Path) -> None:
             jax.clear_caches()  # what was compiled for it would stay in memory
     for line in missing:
         Console().print(line, markup=False)
-    Console().print("The page of these runs: python -m benchmarks report --runs")
+
+
+def _page(names: list[str], runs: Path) -> None:
+    """Makes the page of these runs, if there is something to show, and says where it is."""
+    shown = [] if "all" in names else [n for n in names if _registry.task(n).kind != "descent"]
+    if "all" in names or shown:
+        written = report.write(runs, runs, shown)
+        if written is not None:
+            Console().print(f"The page: {written}", markup=False, soft_wrap=True)
 
 
 def _draw(name: str, folder: Path) -> None:

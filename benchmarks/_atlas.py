@@ -14,10 +14,13 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from PIL import Image
 
-from benchmarks._loop import Run
+from benchmarks._loop import Run, within
 from benchmarks._task import Method, Task
 
 LARGEST = 128  # pixels along the longer side
+MARKS = (10, 20, 40)  # evaluations at which a film has pictures
+# the methods in it: what users have, and ours
+FILMED = ("fr22", "nelder_mead", "cma_es", "py_bobyqa", "newton_cg", "gauss_newton")
 WHITE = 99.5  # percent of the start's differences that are less than white
 
 
@@ -40,13 +43,38 @@ def rendered(task: Task, ran: Mapping[Method, list[Run]]) -> str | None:
     return png(np.concatenate([_small(display(image(y))) for y in shown]))
 
 
+def film(task: Task, ran: Mapping[Method, list[Run]]) -> dict[str, Any] | None:
+    """A film of the first start: what some methods had found after so many evaluations.
+
+    A line of pictures for each method, one below another in one PNG as text, and the image errors;
+    None where the task has no picture or none of the methods ran.
+    """
+    image = task.score.image
+    chosen = {method.name: runs[0] for method, runs in ran.items() if method.name in FILMED}
+    if image is None or not chosen:
+        return None
+    unravel = ravel_pytree(task.problem.like)[1]
+    found = [run[f"found {mark}"] for run in chosen.values() for mark in MARKS]
+    shown = [_small(display(image(unravel(jnp.asarray(y))))) for y in found]
+    errors = {
+        name: [float(run["image_error"][within(run["evaluations"], mark)]) for mark in MARKS]
+        for name, run in chosen.items()
+    }
+    return {"marks": MARKS, "errors": errors, "png": png(np.concatenate(shown))}
+
+
+def frames(shot: dict[str, Any]) -> dict[str, list[np.ndarray]]:
+    """The pictures of a film, by method, one for each of its marks."""
+    tiles = np.split(_read(shot["png"]), len(shot["errors"]) * len(shot["marks"]))
+    count = len(shot["marks"])
+    return {name: tiles[i * count : (i + 1) * count] for i, name in enumerate(shot["errors"])}
+
+
 def stored(task: dict[str, Any], names: list[str]) -> Pictures | None:
     """The pictures of a task's results, whose methods are `names`; None where there are none."""
     if not task.get("pictures"):
         return None
-    with Image.open(io.BytesIO(base64.b64decode(task["pictures"]))) as whole:
-        tiles = np.asarray(whole.convert("RGB")) / 255
-    start, *found, reference = np.split(tiles, len(names) + 2)
+    start, *found, reference = np.split(_read(task["pictures"]), len(names) + 2)
     return Pictures(start, dict(zip(names, found, strict=True)), reference)
 
 
@@ -76,6 +104,12 @@ def png(picture: np.ndarray) -> str:
 def data_uri(text: str) -> str:
     """A PNG as text, as the source of an <img>."""
     return f"data:image/png;base64,{text}"
+
+
+def _read(text: str) -> np.ndarray:
+    """The picture of a PNG as text."""
+    with Image.open(io.BytesIO(base64.b64decode(text))) as whole:
+        return np.asarray(whole.convert("RGB")) / 255
 
 
 def _image(picture: np.ndarray) -> Image.Image:

@@ -12,10 +12,10 @@ from benchmarks import _atlas, _loop, _registry
 from benchmarks._pictures import draw
 from benchmarks._study import setting
 from benchmarks._summary import summarise
-from benchmarks._tables import compare, tables
+from benchmarks._tables import compare, ending, tables
 from benchmarks._task import Method, NotAble, Problem, Solve, precision_of
 
-__all__ = ["compare", "draw", "forgiving", "measure", "tables", "usual"]
+__all__ = ["compare", "draw", "ending", "forgiving", "measure", "tables", "usual"]
 
 
 def usual(name: str, options: Namespace) -> list[str]:
@@ -35,13 +35,16 @@ def measure(name: str, options: Namespace, folder: Path, bar: tqdm | None = None
     if bar is not None:
         methods = [_forgiven(method) for method in methods]
     tasks = {}
+    keep = _atlas.MARKS if _registry.task(name).kind == "scene" else ()
     how = {"setting": setting(options), "fresh": options.fresh, "progress": bar}
     for task in _registry.family(name, options.full):
         seeds = range(options.seeds or task.seeds)
-        runs = _loop.run(task, methods, seeds, folder / "raw" / task.name, **how)
+        runs = _loop.run(task, methods, seeds, folder / "raw" / task.name, keep=keep, **how)
         with precision_of(task):
-            pictures = _atlas.rendered(task, _loop.able(runs))
-            tasks[task.name] = summarise(task, runs) | {"pictures": pictures}
+            ran = _loop.able(runs)
+            shown = {"pictures": _atlas.rendered(task, ran)}
+            shown |= {"film": _atlas.film(task, ran)} if keep else {}
+            tasks[task.name] = summarise(task, runs) | shown
     if bar is not None:
         bar.clear()  # what is printed next would be on its line
     return {"title": _registry.task(name).title, "tasks": tasks}

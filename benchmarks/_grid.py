@@ -1,6 +1,5 @@
 """A table as data, so that the page and the terminal show the same; and how numbers are shown."""
 
-from html import escape
 from typing import NamedTuple
 
 from rich import box
@@ -47,30 +46,12 @@ def to_rich(grid: Grid) -> Table:
         title=escape_markup(grid.title),
         caption=escape_markup(grid.caption),
         box=box.SIMPLE_HEAD,
+        collapse_padding=True,
     )
-    shown.add_column(grid.columns[0])
+    shown.add_column(grid.columns[0], no_wrap=True)
     for column in grid.columns[1:]:
         shown.add_column(column, justify="right" if grid.numbers else "left")
     for row in grid.rows:
         cells = [escape_markup(cell) for cell in (row.name, *row.cells)]
         shown.add_row(*cells, style="bold" if row.strong else None, end_section=row.end)
     return shown
-
-
-def to_html(grid: Grid, swatches: dict[str, str]) -> str:
-    """For the page; wide tables scroll by themselves."""
-    head = "".join(f"<th scope=col>{escape(column)}</th>" for column in grid.columns)
-    body = "".join(_html_row(row, swatches) for row in grid.rows)
-    kind = "numbers" if grid.numbers else "texts"
-    return (
-        f"<figure class=table><figcaption><b>{escape(grid.title)}.</b> {escape(grid.caption)}"
-        f"</figcaption><div class=scroll><table class={kind}><thead><tr>{head}</tr></thead>"
-        f"<tbody>{body}</tbody></table></div></figure>\n"
-    )
-
-
-def _html_row(row: Row, swatches: dict[str, str]) -> str:
-    swatch = swatches.get(row.method or "", "")
-    cells = "".join(f"<td>{escape(cell)}</td>" for cell in row.cells)
-    kind = " class=ours" if row.strong else ""
-    return f"<tr{kind}><th scope=row>{swatch}{escape(row.name)}</th>{cells}</tr>"

@@ -139,7 +139,7 @@ class Runner:
 
     Args:
         task: The task.
-        keep: After so many evaluations what a run found is kept too, beside the last.
+        keep: What a run had found after at most so many evaluations is kept too, beside the last.
     """
 
     def __init__(self, task: Task, keep: Collection[int]):
@@ -171,7 +171,7 @@ class Runner:
             "seconds": np.array(seconds),
             **errors([unravel(y) for y in ys], seed),
             "found": ys[-1],
-            **{f"found {n}": y for n, y in zip(evaluations, ys, strict=True) if n in self._keep},
+            **{f"found {n}": ys[within(evaluations, n)] for n in self._keep},
         }
 
     def _record(self, solve: Solve, seed: int, **until: Any) -> tuple[list[Point], str]:
@@ -250,6 +250,11 @@ def run(
                     found[method] = reason
             bar.update()
     return found
+
+
+def within(evaluations: Sequence[int], most: int) -> int:
+    """The last point of a trace that took no more evaluations."""
+    return int(np.searchsorted(evaluations, most, side="right")) - 1
 
 
 def able(runs: Runs) -> dict[Method, list[Run]]:

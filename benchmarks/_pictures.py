@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks._atlas import stored
+from benchmarks._atlas import frames, stored
 from benchmarks._grid import short
+from benchmarks._names import NAMES, is_ours, name_of
 from benchmarks._style import CROWDED, band, figure, headed, legend, looks, panels
 from benchmarks._summary import COSTS, GAPS, LEVELS, able, grid
 
@@ -38,6 +39,8 @@ def draw(results: dict[str, Any], folder: Path) -> None:
         for cost in COSTS if _has_curves(task) else ():
             _curves(task, cost, into / FILES[cost])
         _images(task, into / "images.png")
+        if task.get("film"):
+            _film(task, into / "film.png")
     if len(tasks) > 1 and all("gap" in errors_of(task) for task in tasks.values()):
         _family(results, folder / "evaluations.png")
 
@@ -47,14 +50,10 @@ def errors_of(task: dict[str, Any]) -> list[str]:
     return [error for error in LEVELS if any(error in f["final"] for f in able(task).values())]
 
 
-def titles_of(tasks: dict[str, Any]) -> dict[str, str]:
+def names_of(tasks: dict[str, Any]) -> dict[str, str]:
     """Of all methods that ran on any of the tasks."""
-    return {name: found["title"] for task in tasks.values() for name, found in able(task).items()}
-
-
-def ours_of(methods: dict[str, Any]) -> list[str]:
-    """Those that are this library's."""
-    return [name for name, found in methods.items() if "(ours)" in found["title"]]
+    ran = (each for task in tasks.values() for each in able(task).items())
+    return {method: name_of(method, found["title"]) for method, found in ran}
 
 
 def _has_curves(task: dict[str, Any]) -> bool:
@@ -65,8 +64,8 @@ def _has_curves(task: dict[str, Any]) -> bool:
 def _curves(task: dict[str, Any], cost: str, path: Path) -> None:
     """Median and quartiles over the starts, a panel for each error."""
     methods, errors = able(task), errors_of(task)
-    strong = ours_of(methods) if len(methods) > CROWDED else []
-    look = looks(methods, strong)
+    strong = list(filter(is_ours, methods)) if len(methods) > CROWDED else []
+    look = looks(methods)
     with figure(path, 1, len(errors), (4.5 * len(errors), 3.8)) as (drawn, axes):
         for axis, error in zip(axes[0], errors, strict=True):
             panel(axis, methods, look, error, cost, strong or methods)
@@ -95,7 +94,8 @@ def panel(
         costs = grid(curve["ends"])
         quartiles = np.nan_to_num(np.array(curve["quartiles"], float), nan=np.inf)
         three = np.maximum(quartiles, FLOORS[error])
-        band(axis, costs, three, look[name], found["title"], 0.15 if name in banded else 0)
+        label = name_of(name, found["title"])
+        band(axis, costs, three, look[name], label, 0.15 if name in banded else 0)
         shown = three[1][np.isfinite(three[1])]
         lowest, highest = min(lowest, *shown), max(highest, *shown)
     axis.set(ylim=(lowest / 1.3, highest * 1.3))
@@ -112,7 +112,7 @@ def _images(task: dict[str, Any], path: Path) -> None:
         return
     shown = [pictures.start, *pictures.found.values(), pictures.reference]
     errors = ["1", *(short(found["first"]) for found in methods.values()), "0"]
-    names = ["Start", *(found["title"] for found in methods.values()), "Reference"]
+    names = ["Start", *names_of({"": task}).values(), "Reference"]
     # each as large as a square one, in lines of about the same length
     tall = math.sqrt(shown[0].shape[0] / shown[0].shape[1])
     lines = -(-len(shown) // max(1, int(ABREAST * tall)))
@@ -128,17 +128,43 @@ def _images(task: dict[str, Any], path: Path) -> None:
             axis.set_title(fill(name, 20), fontsize=8, loc="center")
 
 
+def _film(task: dict[str, Any], path: Path) -> None:
+    """A line for each method, what it had found after some evaluations, beside start and goal."""
+    film, methods = task["film"], able(task)
+    pictures = stored(task, list(methods))
+    assert pictures is not None
+    lines = {name: each for name, each in frames(film).items() if name in methods}
+    heads = ["Start", *(f"{mark} renders" for mark in film["marks"]), "Reference"]
+    wide = SQUARE * pictures.start.shape[1] / pictures.start.shape[0]
+    size = wide * len(heads) + 1.2, (SQUARE + 0.25) * len(lines) + 0.4
+    with figure(path, len(lines), len(heads), size) as (_, axes):
+        for line, (name, found) in zip(axes, lines.items(), strict=True):
+            shown = [pictures.start, *found, pictures.reference]
+            errors = [1.0, *film["errors"][name], 0.0]
+            for axis, picture, error in zip(line, shown, errors, strict=True):
+                axis.imshow(picture, interpolation="nearest")
+                axis.set(xticks=[], yticks=[])
+                axis.spines[:].set_visible(False)
+                axis.set_xlabel(f"{short(100 * error)} % left", fontsize=8)
+            line[0].set_xlabel("")
+            line[-1].set_xlabel("")
+            weight = "bold" if is_ours(name) else "normal"
+            line[0].set_ylabel(name_of(name), weight=weight, color=NAMES[name].colour)
+        for axis, head in zip(axes[0], heads, strict=True):
+            axis.set_title(head, loc="center")
+
+
 def _family(results: dict[str, Any], path: Path) -> None:
     """Evaluations to the smallest gap against dimensions, a panel for each function."""
     tasks = results["tasks"]
-    titles = titles_of(tasks)
-    look = looks(titles)
+    names = names_of(tasks)
+    look = looks(names)
     named = groupby(tasks.items(), key=lambda item: item[0].rpartition("-")[0])
     functions = {name: [task for _, task in members] for name, members in named}
     most = max(task["budget"]["evaluations"] for task in tasks.values())
     with panels(path, functions, COLUMNS, (3, 2.8)) as (drawn, axes):
         for axis, members in zip(axes.flat, functions.values(), strict=False):
-            for method in titles:
+            for method in names:
                 _medians(axis, [task for task in members if method in able(task)], method, look)
             dimensions = [task["dimensions"] for task in members]
             axis.set(xscale="log", yscale="log", ylim=(FEWEST, 1.5 * most))
@@ -146,8 +172,8 @@ def _family(results: dict[str, Any], path: Path) -> None:
             axis.xaxis.minorticks_off()
         for axis in axes[:, 0]:
             axis.set_ylabel("Evaluations")
-        handles = [axes[0, 0].plot([], [], marker="o", **look[name])[0] for name in titles]
-        legend(drawn, handles, list(titles.values()))
+        handles = [axes[0, 0].plot([], [], marker="o", **look[name])[0] for name in names]
+        legend(drawn, handles, list(names.values()))
         headed(
             drawn,
             f"{results['title']}: median evaluations to a gap of {GAP}\n"

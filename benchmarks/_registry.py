@@ -16,6 +16,7 @@ from types import ModuleType
 from benchmarks import methods as methods_package
 from benchmarks import studies as studies_package
 from benchmarks import tasks as tasks_package
+from benchmarks._names import is_ours
 from benchmarks._task import Kind, Method, MethodEntry, Task, TaskEntry
 
 ORDER: tuple[Kind, ...] = ("scene", "large", "network", "program", "function", "descent")
@@ -40,6 +41,14 @@ def task(name: str) -> TaskEntry:
     return _named(tasks(), name, "task")
 
 
+def told(entry: TaskEntry) -> list[str]:
+    """What a task's module says of it, in paragraphs: what is varied, what is left out and why."""
+    found = (module for module in _modules(tasks_package) if entry in module.TASKS.values())
+    module = next(found, None) or inspect.getmodule(entry.build)
+    text = (module.__doc__ if module else None) or ""
+    return [" ".join(part.split()) for part in text.strip().split("\n\n")]
+
+
 def family(name: str, full: bool) -> list[Task]:
     """The task of a name, or all that it stands for."""
     built = task(name).build(full)
@@ -59,7 +68,7 @@ def _entries() -> dict[str, tuple[ModuleType, MethodEntry]]:
         for name, entry in module.METHODS.items()
     }
     # ours last: in tables and figures they are looked for there
-    return dict(sorted(found.items(), key=lambda item: ("(ours)" in item[1][1].title, item[0])))
+    return dict(sorted(found.items(), key=lambda item: (is_ours(item[0]), item[0])))
 
 
 def methods(kind: Kind | None = None) -> list[str]:

@@ -3,7 +3,8 @@
 A module of `studies` has HELP, one line; OPTIONS, the names of the flags that it knows, of those in
 `__main__.FLAGS`; `measure`, (options, folder) -> results, a dict that JSON knows, where `options`
 has these flags; `draw`, (results, folder) -> None; and `tables`, results -> Grids. Pictures and
-tables know nothing but the results, so that they can be made again from the file.
+tables know nothing but the results, so that they can be made again from the file. It may have
+`ending`, results -> (Grids, lines), which a run ends with in place of all tables.
 """
 
 import json
@@ -49,10 +50,15 @@ def run(
     """
     results = write(about(options) | (measure or study.measure)(options, folder), folder)
     study.draw(results, folder)
-    show(study.tables(results))
+    grids, lines = (
+        study.ending(results) if hasattr(study, "ending") else (study.tables(results), [])
+    )
+    show(grids)
     theirs = committed(folder.name) if getattr(options, "compare", False) else None
     if theirs is not None:
         show(study.compare(results, theirs))
+    for line in lines:
+        Console().print(line, markup=False, highlight=False)
     Console().print(f"Written to {folder}")
 
 

@@ -1,8 +1,8 @@
-"""One look for all figures: colours for colour-blind readers too, thin grids, no frames."""
+"""One look for all figures: each method its own line, thin grids, no frames."""
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from itertools import cycle, zip_longest
+from itertools import product, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +14,11 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.figure import Figure
 
-# Okabe and Ito 2008, without yellow, which is too pale for a line
+from benchmarks._names import DASHED, DOTTED, MIXED, NAMES, SOLID, is_ours
+
+# of what is no method; Okabe and Ito 2008, without yellow, which is too pale for a line
 COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
-# for a few among many: their own colours, which none of the others have
-STRONG = ("#0072B2", "#D55E00", "#000000", "#E69F00")
-FAINT = ("#009E73", "#CC79A7", "#56B4E9", "#8C6D31", "#7F7F7F", "#9467BD", "#A0A000")
-DASHES = ("-", "--", "-.", (0, (1, 1)), (0, (5, 1, 1, 1, 1, 1)))
+DASHES = {SOLID: "-", DASHED: "--", DOTTED: (0, (1, 1)), MIXED: "-."}
 CROWDED = 8  # methods, beyond which a legend needs a side of its own
 HANDLE, LETTER = 0.6, 0.065  # inches, of a line in a legend and of what is written beside it
 STYLE: dict[Any, Any] = {
@@ -93,25 +92,21 @@ def legend(drawn: Figure, handles: list, labels: list[str]) -> None:
         drawn.legend(handles, labels, loc="outside lower center", ncols=ncols)
 
 
-def looks(names: Collection[str], strong: Collection[str] = ()) -> dict[str, dict]:
-    """A colour and a dash for each name, the same in every figure of these names.
+def looks(names: Collection[str]) -> dict[str, dict]:
+    """The line of each name: a method has its own in every figure, all else one in turn.
 
-    Where there are many, all lines are lost: name some as `strong`, and they are thick, on top, in
-    colours of their own, the first ones solid, and the others thin.
+    Where there are many methods all lines are lost: those of ours are thick and on top then, the
+    others thin.
     """
-    if not strong:
-        return _lines(names, zip(cycle(COLOURS), cycle(DASHES), strict=False))
-    # dashes where the colours are used up
-    product = lambda colours: ((colour, dash) for dash in DASHES for colour in colours)
-    others = [name for name in names if name not in strong]
-    thin = _lines(others, product(FAINT), linewidth=1.1)
-    chosen = [name for name in strong if name in names]
-    look = thin | _lines(chosen, product(STRONG), linewidth=2.6, zorder=3)
-    return {name: look[name] for name in names}
-
-
-def _lines(names: Iterable[str], pairs: Iterable[tuple], **rest) -> dict[str, dict]:
-    return {
-        name: {"color": colour, "linestyle": dash, **rest}
-        for name, (colour, dash) in zip(names, pairs, strict=False)
-    }
+    spare = product(DASHES.values(), COLOURS)
+    look = {}
+    for name in names:
+        if name in NAMES:
+            look[name] = {"color": NAMES[name].colour, "linestyle": DASHES[NAMES[name].dash]}
+        else:
+            dash, colour = next(spare)
+            look[name] = {"color": colour, "linestyle": dash}
+    if len(look) > CROWDED:
+        for name in filter(NAMES.get, look):
+            look[name] |= {"linewidth": 2.6, "zorder": 3} if is_ours(name) else {"linewidth": 1.1}
+    return look

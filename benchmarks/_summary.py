@@ -62,7 +62,8 @@ def took(runs: list[Run], error: str, level: float) -> dict[str, Any]:
     """From how many starts a level is reached, and quartiles of what that costs."""
     costs = {cost: [cost_to_level(run[error], run[cost], level) for run in runs] for cost in COSTS}
     solved = sum(math.isfinite(cost) for cost in costs["evaluations"])
-    return {"solved": solved} | {cost: quartiles(values) for cost, values in costs.items()}
+    found = {cost: quartiles(values) | without_one(values) for cost, values in costs.items()}
+    return {"solved": solved} | found
 
 
 def curve(runs: list[Run], error: str, cost: str) -> dict[str, Any]:
@@ -97,6 +98,16 @@ def quartiles(values: Sequence[float]) -> dict[str, float | None]:
     return dict(zip(("median", "lower", "upper"), found, strict=True))
 
 
+def without_one(values: Sequence[float]) -> dict[str, float | None]:
+    """The least and the most that the median is when any one of the values is left out."""
+    if len(values) < 2:
+        return {}
+    left = (quartiles([*values[:i], *values[i + 1 :]])["median"] for i in range(len(values)))
+    medians = sorted(math.inf if median is None else median for median in left)
+    ends = zip(("least", "most"), (medians[0], medians[-1]), strict=True)
+    return {name: value if math.isfinite(value) else None for name, value in ends}
+
+
 def quarters(values: Any) -> list[Any]:
     """Lower quartile, median and upper quartile over the first axis, with means between values."""
     return np.quantile(values, [0.25, 0.5, 0.75], axis=0).tolist()
@@ -110,12 +121,6 @@ def band(runs: list[Run], error: str, cost: str, costs: Any) -> list[list[float]
         last = np.searchsorted(run[cost], costs * (1 + 1e-9), side="right") - 1
         errors.append(np.asarray(run[error])[last])
     return quarters(errors)
-
-
-def unable(task: dict[str, Any]) -> dict[str, str]:
-    """By title, why the others did not run."""
-    methods = task["methods"].values()
-    return {found["title"]: found["not_able"] for found in methods if "not_able" in found}
 
 
 def able(task: dict[str, Any]) -> dict[str, Any]:

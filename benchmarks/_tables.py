@@ -5,14 +5,17 @@ from itertools import product
 from typing import Any
 
 from benchmarks._grid import Grid, Row, short, spread
-from benchmarks._pictures import GAP, errors_of, titles_of
-from benchmarks._summary import COSTS, able, unable
+from benchmarks._names import name_of
+from benchmarks._pictures import GAP, errors_of, names_of
+from benchmarks._reached import not_able, others, reached
+from benchmarks._summary import COSTS, able
 
 CAPTIONS = {
     "image_error": "On renders without noise, which are not charged.",
     "parameter_error": "Seconds are without compilation.",
     "gap": "It is absolute.",
 }
+MARK = "» "  # before what is ours, as a terminal may have no bold
 COMPARED = "99"  # percent: the level at which runs are put beside the committed ones
 
 
@@ -22,15 +25,29 @@ def tables(results: dict[str, Any]) -> Iterator[Grid]:
         for error in errors_of(task):
             yield _took(task, error)
         yield _left(task)
-    if len(results["tasks"]) > 1:
+    if _compared_by_gap(results):
         yield _family(results)
+
+
+def ending(results: dict[str, Any]) -> tuple[list[Grid], list[str]]:
+    """What a run ends with: the tables of those that got there, ours marked, and a few lines."""
+    grids, lines = [], []
+    for task in filter(able, results["tasks"].values()):
+        grid = reached(task, brief=True)
+        rows = (row._replace(name=MARK * row.strong + row.name) for row in grid.rows)
+        grids.append(grid._replace(rows=tuple(rows)))
+        lines.append(others(task))
+    if _compared_by_gap(results):
+        grids.append(_family(results))
+    lines += [not_able(task) for task in results["tasks"].values()]
+    return grids, list(dict.fromkeys(filter(None, lines)))
 
 
 def _took(task: dict[str, Any], error: str) -> Grid:
     kind, unit = error.replace("_", " "), "" if error == "gap" else " %"
-    rows = []
-    for found in able(task).values():
-        name = found["title"]
+    names, rows = names_of({"": task}), []
+    for method, found in able(task).items():
+        name = names[method]
         for level, took in found["took"][error].items():
             there = f"{took['solved']}/{found['starts']}"
             rows.append(Row(name, (level + unit, there, *(spread(took[cost]) for cost in COSTS))))
@@ -46,18 +63,24 @@ def _took(task: dict[str, Any], error: str) -> Grid:
 
 def _left(task: dict[str, Any]) -> Grid:
     budget = task["budget"]
-    not_able = " ".join(f"{who} is not able here: {why}." for who, why in unable(task).items())
     rows = []
-    for found in able(task).values():
+    for name, found in able(task).items():
         errors = [found["final"][error] for error in ("image_error", "parameter_error")]
         shown = (spread(each) for each in (*errors, found["distance"]))
-        rows.append(Row(found["title"], (*shown, f"{found['warm_up_seconds']:.1f} s")))
+        cells = (*shown, f"{found['warm_up_seconds']:.1f} s")
+        rows.append(Row(name_of(name, found["title"]), cells))
     return Grid(
         title=f"At the end, after {budget['evaluations']} evaluations or {budget['seconds']:g} s",
-        caption=f"Distance in units of the parameters. Compilation is not charged. {not_able}",
+        caption=f"Distance in units of the parameters, without compilation. {not_able(task)}",
         columns=("method", "image error", "parameter error", "distance", "compile"),
         rows=tuple(rows),
     )
+
+
+def _compared_by_gap(results: dict[str, Any]) -> bool:
+    """Whether it is a family whose lowest values are known."""
+    tasks = results["tasks"].values()
+    return len(tasks) > 1 and all("gap" in errors_of(task) for task in tasks)
 
 
 def _family(results: dict[str, Any]) -> Grid:
@@ -76,8 +99,8 @@ def _family(results: dict[str, Any]) -> Grid:
         caption="Median over the starts; how many got there; - is no more than half.",
         columns=("method", *tasks),
         rows=tuple(
-            Row(title, tuple(cell(task, method) for task in tasks.values()))
-            for method, title in titles_of(tasks).items()
+            Row(name, tuple(cell(task, method) for task in tasks.values()))
+            for method, name in names_of(tasks).items()
         ),
     )
 
@@ -90,7 +113,7 @@ def compare(results: dict[str, Any], committed: dict[str, Any]) -> Iterator[Grid
         for method, found in able(task).items():
             pairs = product(COSTS, (found, theirs[method])) if method in theirs else ()
             if cells := tuple(_compared(each, cost) for cost, each in pairs):
-                rows.append(Row(found["title"], cells))
+                rows.append(Row(name_of(method, found["title"]), cells))
         yield Grid(
             title=f"{task['title']}: to {COMPARED} % of the image error, here and committed",
             caption=f"Committed: {committed['command']}, {committed['machine']['cpu']}. "

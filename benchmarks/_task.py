@@ -210,23 +210,52 @@ class Method(NamedTuple):
     source: str  # a change of it makes earlier results stale
 
 
+class Traits(NamedTuple):
+    """What a user would say of a task before running anything.
+
+    Args:
+        parameters: How many there are; of a family, how many each of its quick members has.
+        plateaus: Whether there are regions where the loss does not tell the way, as it is constant
+            there, all but constant, or made of steps.
+        residuals: Whether it says residuals, as a picture minus its reference, or only one number.
+    """
+
+    parameters: tuple[int, ...]
+    plateaus: bool
+    residuals: bool = True
+
+
 class TaskEntry(NamedTuple):
     """A line of a module's TASKS: what is sought, of which kind it is, and how it is built.
 
     `build(full)` gives a Task, or a list of them where one name stands for a family, such as a
-    function in several dimensions; they are named "function-5d".
+    function in several dimensions; they are named "function-5d". A descent has no traits.
     """
 
     title: str
     kind: Kind
     build: Callable[..., Task | list[Task]]
+    traits: Traits | None = None
 
 
 def entry(
-    kind: Kind, build: Callable[..., Task | list[Task]], name: str, title: str, **settings: Any
+    kind: Kind,
+    build: Callable[..., Task | list[Task]],
+    name: str,
+    title: str,
+    *,
+    parameters: int | tuple[int, ...],
+    plateaus: bool,
+    one_number: bool = False,
+    **settings: Any,
 ) -> dict[str, TaskEntry]:
-    """TASKS of one line, which is built by `build(full, name=name, title=title, **settings)`."""
-    return {name: TaskEntry(title, kind, partial(build, name=name, title=title, **settings))}
+    """TASKS of one line, which is built by `build(full, name=name, title=title, **settings)`.
+
+    The others are its traits.
+    """
+    sizes = parameters if isinstance(parameters, tuple) else (parameters,)
+    made = partial(build, name=name, title=title, **settings)
+    return {name: TaskEntry(title, kind, made, Traits(sizes, plateaus, not one_number))}
 
 
 class MethodEntry(NamedTuple):

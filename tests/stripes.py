@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from benchmarks import _registry
-from benchmarks._task import Budget, MethodEntry, Problem, Score, Task, TaskEntry
+from benchmarks._task import Budget, MethodEntry, Problem, Score, Task, TaskEntry, Traits
 
 TITLE = "Stripes"
 SIDE = 8  # pixels
@@ -61,7 +61,8 @@ def failing(problem):
 def registered(monkeypatch, tasks=None, methods=None):
     """Makes a registry of some tasks, name -> build, and of some methods, name -> prepare."""
     tasks = {"stripes": build} if tasks is None else tasks
-    entries = {name: TaskEntry(name.title(), "scene", build) for name, build in tasks.items()}
+    traits = Traits((2,), plateaus=True)
+    entries = {n: TaskEntry(n.title(), "scene", build, traits) for n, build in tasks.items()}
     methods = {"halving": halving, "failing": failing} if methods is None else methods
     here = sys.modules[__name__]
     found = {

@@ -2,12 +2,12 @@
 
 import json
 from argparse import Namespace
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from made_scenes import never, scene
 
 import smoothdiff as sd
 from benchmarks import _registry, _study
@@ -99,12 +99,10 @@ def test_renders_are_multiplied_by_evaluations(tmp_path, capsys):
 
 
 def test_what_ours_takes_to_99_percent_is_read_from_results(monkeypatch, tmp_path):
-    took = {"gauss_newton": 7, "newton_cg": 5, "first_order": None}
-    reached = lambda name, error, level, cost: SimpleNamespace(median=took[name])
-    scene = SimpleNamespace(ran=took, ours="gauss_newton", reached=reached)
-    monkeypatch.setattr(savings, "load", lambda name, folder: {tmp_path: scene}.get(folder))
+    made = never(scene("mug", gauss_newton=7, newton_cg=5, first_order=1), "first_order")
+    monkeypatch.setattr(savings, "load", lambda name, folder: [made][folder != tmp_path :])
     found = savings.to_99("mug", (tmp_path / "other", tmp_path))
-    assert found == {"evaluations": 7, "first order": None, "second order": 5}
+    assert found == {"evaluations": 14, "first order": None, "second order": pytest.approx(1)}
     assert set(savings.to_99("mug", ()).values()) == {None}
 
 

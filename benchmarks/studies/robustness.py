@@ -22,6 +22,7 @@ from benchmarks import _registry
 from benchmarks._atlas import display
 from benchmarks._grid import Grid, Row, spread
 from benchmarks._loop import Run, able, flat, run
+from benchmarks._names import name_of
 from benchmarks._study import setting
 from benchmarks._style import band, figure, legend, looks
 from benchmarks._summary import COSTS, cost_to_level, quartiles
@@ -135,7 +136,6 @@ def _decoded(linear: np.ndarray, quality: int) -> np.ndarray:
 
 def measure(options: Namespace, folder: Path) -> dict[str, Any]:
     """What the methods take in each case of each study of each scene."""
-    titles = {name: _registry.method(name).title for name in USUAL}
     scenes: dict[str, Any] = {name: {} for name in SCENES}
     how: dict[str, Any] = {"setting": setting(options), "fresh": options.fresh}
     for name, studies in scenes.items():
@@ -145,7 +145,7 @@ def measure(options: Namespace, folder: Path) -> dict[str, Any]:
             for method, found in able(runs).items():
                 lines = studies.setdefault(case.study, {}).setdefault(method.name, [])
                 lines.append(line(case, found))
-    return {"titles": titles, "scenes": scenes}
+    return {"scenes": scenes}
 
 
 def line(case: Case, runs: list[Run]) -> dict[str, Any]:
@@ -172,7 +172,8 @@ def tables(results: dict[str, Any]) -> list[Grid]:
                     value = str(each["value"]) if study in AXES else ""
                     costs = (spread(each[what]) for what in (*COSTS, "distance"))
                     solved = f"{sum(end < SOLVED for end in each['ended'])}/{len(each['ended'])}"
-                    rows.append(Row(scene, (study, value, name, *costs, solved)))
+                    cells = (study, value, name_of(name), *costs, solved)
+                    rows.append(Row(scene, cells))
             rows[-1] = rows[-1]._replace(end=True)
     caption = (
         "Median [quartiles] to 90 % of the parameter error, and the final distance in units of "
@@ -184,8 +185,8 @@ def tables(results: dict[str, Any]) -> list[Grid]:
 
 def draw(results: dict[str, Any], folder: Path) -> None:
     """Success and the final distance against the start's; costs and distance in each study."""
-    scenes, titles = results["scenes"], results["titles"]
-    look = {name: style | {"marker": "o", "ms": 3} for name, style in looks(titles).items()}
+    scenes = results["scenes"]
+    look = {name: style | {"marker": "o", "ms": 3} for name, style in looks(USUAL).items()}
     size = (13, 5 * len(scenes))
     with figure(folder / "robustness.png", 2 * len(scenes), 4, size) as (drawn, axes):
         for i, (scene, studies) in enumerate(scenes.items()):
@@ -199,7 +200,7 @@ def draw(results: dict[str, Any], folder: Path) -> None:
                 axis.set_yscale("log")
                 axis.axhline(SOLVED, color="0.6", lw=0.6, ls=":")
         handles, names = axes[0, 0].get_legend_handles_labels()
-        legend(drawn, handles, [titles[name] for name in names])
+        legend(drawn, handles, list(map(name_of, names)))
 
 
 def _starts(above: Any, below: Any, methods: dict[str, Any], look: dict[str, dict]) -> None:

@@ -4,6 +4,7 @@ Times the evaluations that ours takes to 99 %, as results have them, that is wha
 in seconds; as if the dearer picture took as many evaluations.
 """
 
+import math
 from argparse import Namespace
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -14,6 +15,7 @@ from tqdm import tqdm
 
 from benchmarks import _registry
 from benchmarks._grid import Grid, short
+from benchmarks._reached import took
 from benchmarks._study import COMMITTED
 from benchmarks._style import COLOURS, figure
 from benchmarks._task import NotAble, Task
@@ -60,14 +62,14 @@ def to_99(name: str, folders: Sequence[Path]) -> dict[str, float | None]:
 
     The first of the folders that has results of the scene is read.
     """
-    scene = next(filter(None, (load(name, folder) for folder in folders)), None)
+    scene = next((scene for folder in folders for scene in load(name, folder)), None)
     if scene is None:
         return dict.fromkeys(("evaluations", "first order", "second order"))
 
     def fastest(methods: Sequence[str | None], cost: str) -> float | None:
         ran = (name for name in methods if name in scene.ran)
-        took = (scene.reached(name, "image_error", "99", cost).median for name in ran)
-        return min((each for each in took if each is not None), default=None)
+        medians = (took(scene.ran[name], cost).median for name in ran)
+        return min((each for each in medians if math.isfinite(each)), default=None)
 
     return {
         "evaluations": fastest([scene.ours], "evaluations"),

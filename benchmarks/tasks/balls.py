@@ -57,6 +57,8 @@ def unsorted(world: Any) -> Description:
 TASKS = scene_entry(
     "occlusion",
     "Occlusion: position of a ball behind a pillar",
+    parameters=2,
+    plateaus=True,
     scene=behind_a_pillar,
     params={"ball.translate": lambda y: jnp.array([y[0], 0.0, y[1]])},
     reference=[1.9, 0.4],
@@ -68,6 +70,8 @@ TASKS = scene_entry(
 ) | scene_entry(
     "sort",
     "Sort: places of four coloured balls",
+    parameters=8,
+    plateaus=True,
     scene=unsorted,
     params={
         f"ball{i}.translate": lambda y, i=i: jnp.array([y[2 * i], 0.0, y[2 * i + 1]])

@@ -72,6 +72,8 @@ TASKS = (
     function(
         "box2",
         "Box2: position of a square",
+        parameters=2,
+        plateaus=True,
         draw=draw,
         image=draw,
         reference=on_plateau((0.5, 0.5)),
@@ -82,6 +84,8 @@ TASKS = (
     | function(
         "box10",
         "Box10: positions of five squares whose colours add up",
+        parameters=10,
+        plateaus=True,
         draw=draw,
         image=draw,
         **FIVE,
@@ -89,6 +93,8 @@ TASKS = (
     | function(
         "box10-occluding",
         "Box10, occluding: positions of five squares that hide each other",
+        parameters=10,
+        plateaus=True,
         draw=draw_occluding,
         image=draw_occluding,
         **FIVE,

@@ -60,4 +60,11 @@ def build(full: bool, **named: Any) -> Task:
     )
 
 
-TASKS = entry("scene", build, "brdf", "BRDF: Phong's model of a sphere under a point light")
+TASKS = entry(
+    "scene",
+    build,
+    "brdf",
+    "BRDF: Phong's model of a sphere under a point light",
+    parameters=7,
+    plateaus=False,
+)

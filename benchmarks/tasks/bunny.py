@@ -85,6 +85,8 @@ def over_mirrors(world: Any) -> Description:
 TASKS = scene_entry(
     "bunny",
     "Bunny: position and rotation",
+    parameters=3,
+    plateaus=False,
     scene=before_the_camera,
     params={
         "bunny.translate": lambda y: jnp.array([y[0], 0.0, y[1]]),
@@ -99,6 +101,8 @@ TASKS = scene_entry(
 ) | scene_entry(
     "mirror",
     "Mirror: a body seen over two mirrors",
+    parameters=3,
+    plateaus=True,
     scene=over_mirrors,
     # the offset is along the floor: mirrors show it as one in the plane of the picture
     params={

@@ -103,6 +103,8 @@ LIMIT, START = 1.5, 0.5
 TASKS = scene_entry(
     "camera",
     "Camera: position and direction, six unknowns",
+    parameters=6,
+    plateaus=False,
     scene=still_life,
     params=POSE,
     reference=[0.3, -0.2, 0.25, -0.3, 0.2, 0.35],
@@ -113,6 +115,8 @@ TASKS = scene_entry(
 ) | scene_entry(
     "orthographic",
     "Orthographic camera: direction, place and zoom",
+    parameters=6,
+    plateaus=False,
     scene=from_afar,
     params=PARALLEL,
     reference=[0.3, -0.2, -0.3, 0.2, 0.35, 0.4],

@@ -133,4 +133,11 @@ def _basis(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return spline(places), spline.derivative()(places)
 
 
-TASKS = entry("large", build, "caustic", "Caustic: 1,024 coefficients of a refracting height field")
+TASKS = entry(
+    "large",
+    build,
+    "caustic",
+    "Caustic: 1,024 coefficients of a refracting height field",
+    parameters=1_024,
+    plateaus=False,
+)

@@ -188,6 +188,8 @@ TASKS = entry(
     network_task,
     "cnn",
     "CNN: 267,745 weights of a network that sees a mug's rotation",
+    parameters=267_745,
+    plateaus=True,
     params=ROTATION,
     spread=(2.2,),
 ) | entry(
@@ -195,6 +197,8 @@ TASKS = entry(
     network_task,
     "cnn5",
     "CNN5: 268,773 weights of a network that sees a mug's pose and colour",
+    parameters=268_773,
+    plateaus=True,
     params=POSE,
     spread=(1.5,) * 5,
 )

@@ -56,6 +56,8 @@ def scene(world: Any) -> Description:
 TASKS = scene_entry(
     "cornell-box",
     "Cornell box: lamp and rotations of boxes",
+    parameters=4,
+    plateaus=True,
     scene=scene,
     # y is the offset of the lamp along x and y in scene units, and two angles in radians
     params={

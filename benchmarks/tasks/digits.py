@@ -157,7 +157,19 @@ def spline_vae(full: bool, **named: Any) -> Task:
     return _task(full, draw, solved_decoder(code), look, "decoders draw the digits", **named)
 
 
-TASKS = entry("program", mlp, "mlp", "MLP: 35,152 weights of a network that draws a digit")
+TASKS = entry(
+    "program",
+    mlp,
+    "mlp",
+    "MLP: 35,152 weights of a network that draws a digit",
+    parameters=35_152,
+    plateaus=False,
+)
 TASKS |= entry(
-    "program", spline_vae, "spline-vae", "Spline VAE: 8,764 weights of a decoder that draws digits"
+    "program",
+    spline_vae,
+    "spline-vae",
+    "Spline VAE: 8,764 weights of a decoder that draws digits",
+    parameters=8_764,
+    plateaus=True,
 )

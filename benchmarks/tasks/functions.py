@@ -173,14 +173,47 @@ def bbob(full: bool, **named: Any) -> list[Task]:
 
 
 TASKS = (
-    entry("function", quad, "quad", "Quad: a quadratic in 2-D")
-    | entry("function", rosenbrock, "rosenbrock", "Rosenbrock's valley")
+    entry(
+        "function",
+        quad,
+        "quad",
+        "Quad: a quadratic in 2-D",
+        parameters=2,
+        plateaus=False,
+        one_number=True,
+    )
+    | entry(
+        "function",
+        rosenbrock,
+        "rosenbrock",
+        "Rosenbrock's valley",
+        parameters=(2, 10),
+        plateaus=False,
+    )
     | entry(
         "function",
         negated_gaussian,
         "negated-gaussian",
         "Negated Gaussian: a minimum among indefinite Hessians",
+        parameters=2,
+        plateaus=False,
+        one_number=True,
     )
-    | entry("function", ellipsoid, "ellipsoid", "Ellipsoid of condition number 1e6")
-    | entry("function", bbob, "bbob", "BBOB: eight noiseless functions")
+    | entry(
+        "function",
+        ellipsoid,
+        "ellipsoid",
+        "Ellipsoid of condition number 1e6",
+        parameters=(5,),
+        plateaus=False,
+    )
+    | entry(
+        "function",
+        bbob,
+        "bbob",
+        "BBOB: eight noiseless functions",
+        parameters=(5, 5, 5),
+        plateaus=False,
+        one_number=True,
+    )
 )

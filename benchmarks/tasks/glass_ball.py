@@ -46,6 +46,8 @@ def environment() -> Float[np.ndarray, "height width 3"]:
 TASKS = scene_entry(
     "glass-ball",
     "Glass ball: tint and index of refraction",
+    parameters=4,
+    plateaus=False,
     scene=scene,
     # y is red, green and blue of the tint, and the index of refraction less one
     params={

@@ -38,6 +38,8 @@ def scene(world: Any) -> Description:
 TASKS = scene_entry(
     "global-illumination",
     "Global illumination: an object seen by its bounce light",
+    parameters=2,
+    plateaus=True,
     scene=scene,
     # y is the offset along x and y in scene units; the box is 1.8 long
     params={"box.translate": lambda y: jnp.array([y[0], y[1], 0.0])},

@@ -128,4 +128,11 @@ def build(full: bool, name: str, title: str) -> list[Task]:
     ]
 
 
-TASKS = entry("program", build, "gravity", "Gravity: three cubes that are dropped")
+TASKS = entry(
+    "program",
+    build,
+    "gravity",
+    "Gravity: three cubes that are dropped",
+    parameters=(5, 5),
+    plateaus=False,
+)

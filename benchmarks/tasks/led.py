@@ -55,6 +55,8 @@ def support():
 TASKS = program(
     "led",
     "LED: 336 binary switches of a display",
+    parameters=336,
+    plateaus=True,
     draw=draw,
     reference=REFERENCE,
     support=support,

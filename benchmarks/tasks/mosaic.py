@@ -83,6 +83,8 @@ def support():
 TASKS = program(
     "mosaic",
     "Mosaic: rotations of 320 cubes",
+    parameters=320,
+    plateaus=False,
     draw=draw,
     reference=REFERENCE,
     support=support,

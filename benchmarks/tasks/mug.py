@@ -64,6 +64,8 @@ TURNED = {"handle.rotate": lambda y: y[0], "handle.translate": move_of_handle}
 TASKS = scene_entry(
     "mug",
     "Mug: rotation, told by the handle",
+    parameters=1,
+    plateaus=True,
     scene=scene,
     params=TURNED,
     reference=[-1.8],

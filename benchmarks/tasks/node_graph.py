@@ -67,6 +67,8 @@ def draw(y: Float[Array, "24"]) -> Float[Array, "32 32 3"]:
 TASKS = program(
     "node-graph",
     "Node graph: the edges of a procedural texture",
+    parameters=24,
+    plateaus=True,
     draw=draw,
     reference=REFERENCE,
     sigma=0.2,

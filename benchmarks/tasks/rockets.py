@@ -65,6 +65,8 @@ def fly10(y: Float[Array, "10"]) -> Float[Array, "10 2"]:
 TASKS = function(
     "rocket",
     "Rocket: times at which the engine was switched",
+    parameters=3,
+    plateaus=True,
     draw=fly,
     reference=REFERENCE,
     sigma=0.4,
@@ -74,6 +76,8 @@ TASKS = function(
 ) | program(
     "rocket10",
     "Rocket10: when ten engines are switched off",
+    parameters=10,
+    plateaus=True,
     draw=fly10,
     reference=REFERENCE10,
     sigma=0.33,

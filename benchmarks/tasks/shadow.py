@@ -40,4 +40,6 @@ def build(full: bool, spp: int = 4, **named: Any) -> Task:
     )
 
 
-TASKS = entry("scene", build, "shadow", "Shadow: position of an unseen sphere")
+TASKS = entry(
+    "scene", build, "shadow", "Shadow: position of an unseen sphere", parameters=2, plateaus=True
+)

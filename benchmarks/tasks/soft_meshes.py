@@ -207,6 +207,18 @@ def painted(directions: Positions) -> np.ndarray:
     return (1 - brown) * colour + brown * np.array(BROWN)
 
 
-TASKS = entry("large", suzanne, "suzanne", "Suzanne: 7,686 coordinates of a mesh") | entry(
-    "large", banana, "banana", "Banana: 16,422 coordinates and colours of a mesh"
+TASKS = entry(
+    "large",
+    suzanne,
+    "suzanne",
+    "Suzanne: 7,686 coordinates of a mesh",
+    parameters=7_686,
+    plateaus=False,
+) | entry(
+    "large",
+    banana,
+    "banana",
+    "Banana: 16,422 coordinates and colours of a mesh",
+    parameters=16_422,
+    plateaus=False,
 )

@@ -41,4 +41,11 @@ def build(full: bool, **named: Any) -> Task:
     )
 
 
-TASKS = entry("program", build, "texture256", "Texture256: 196,608 values of a texture")
+TASKS = entry(
+    "program",
+    build,
+    "texture256",
+    "Texture256: 196,608 values of a texture",
+    parameters=196_608,
+    plateaus=False,
+)

@@ -93,4 +93,11 @@ def _meets(corners: np.ndarray) -> np.ndarray:
     return (low[..., None] <= texel) & (texel <= high[..., None])
 
 
-TASKS = entry("large", build, "texture32", "Texture32: 1,024 texels of a tilted poster")
+TASKS = entry(
+    "large",
+    build,
+    "texture32",
+    "Texture32: 1,024 texels of a tilted poster",
+    parameters=1_024,
+    plateaus=False,
+)

@@ -47,6 +47,8 @@ def draw(y: Float[Array, "3"]) -> Float[Array, "64 64 3"]:
 TASKS = program(
     "wicker",
     "Wicker: integer counts of a woven texture",
+    parameters=3,
+    plateaus=True,
     draw=draw,
     reference=REFERENCE,
     sigma=0.33,

@@ -9,6 +9,7 @@ import numpy as np
 
 from benchmarks import _style
 from benchmarks._grid import Grid, Row
+from benchmarks._names import is_ours, name_of
 from benchmarks.studies.profiles.shares import PAIRS, POINTS, TAUS
 
 DRAWN = ("0.001", PAIRS)  # levels; each panel has one of these
@@ -18,22 +19,22 @@ ABREAST = 4
 def tables(results: dict[str, Any]) -> Iterator[Grid]:
     """Shares at some budgets, a table for each set; and what did not run."""
     for _, panels in groupby(results["panels"], key=lambda panel: panel["set"]):
-        yield _set(list(panels), results["methods"])
+        yield _set(list(panels), list(results["methods"]))
     if results["missing"]:
         rows = tuple(Row(who, (f"not able: {why}",)) for who, why in results["missing"].items())
         yield Grid("Did not run", "", ("", ""), rows, numbers=False)
 
 
-def _set(panels: list[dict[str, Any]], titles: dict[str, str]) -> Grid:
+def _set(panels: list[dict[str, Any]], methods: list[str]) -> Grid:
     rows = []
     for panel in panels:
         name = f"{panel['title']} ({panel['problems']})"
-        for method, title in titles.items():
+        for method in methods:
             of = [found[method]["at"] for found in panel["levels"].values() if method in found]
             shares = ("/".join(f"{100 * each:.0f}" for each in at) for at in zip(*of, strict=True))
             if of:
                 failed = str(panel["failed"].get(method, ""))
-                rows.append(Row(name, (title, *shares, failed), strong="(ours)" in title))
+                rows.append(Row(name, (name_of(method), *shares, failed), strong=is_ours(method)))
                 name = ""
         rows[-1:] = [row._replace(end=True) for row in rows[-1:]]
     what = f"problems solved to {'/'.join(map('{:g}'.format, TAUS))}, by exact values"
@@ -54,8 +55,7 @@ def _unit(panel: dict[str, Any]) -> str:
 
 def draw(results: dict[str, Any], folder: Path) -> None:
     """The share that is solved, against evaluations; one panel for each kind."""
-    titles = results["methods"]
-    look = _style.looks(titles, [name for name, title in titles.items() if "(ours)" in title])
+    look = _style.looks(results["methods"])
     panels = {panel["title"]: panel for panel in results["panels"]}
     if not panels:
         return
@@ -68,6 +68,6 @@ def draw(results: dict[str, Any], folder: Path) -> None:
             axis.set(xscale="log", ylim=(-0.02, 1.02), xlabel=f"Evaluations / {_unit(panel)}")
         for axis in axes[:, 0]:
             axis.set_ylabel("Share solved")
-        handles = [axes[0, 0].plot([], [], **look[name])[0] for name in titles]
-        _style.legend(drawn, handles, list(titles.values()))
+        handles = [axes[0, 0].plot([], [], **line)[0] for line in look.values()]
+        _style.legend(drawn, handles, list(map(name_of, look)))
         _style.headed(drawn, "Problems solved to 0.001; of BBOB, pairs of function and target")

@@ -1,49 +1,50 @@
-"""The report of the scenes: one page, and the same tables on the terminal; nothing is run.
+"""The page of all scenes, and the same in short on the terminal; nothing is run.
 
-`python -m benchmarks report` reads the committed results, `report --runs` what was run here. Both
-write into the folder of runs; a report of some scenes has a name of its own.
+`python -m benchmarks report` reads the committed results and writes the page beside them, `report
+--runs` what was run here. A report of some scenes has a name of its own, beside what was run.
 """
 
 from argparse import Namespace
-from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
 
 from benchmarks import _registry, _study
-from benchmarks._grid import Grid
-from benchmarks.studies.report import _tables
-from benchmarks.studies.report._scene import Scene, load
+from benchmarks.studies.report._compare import in_one_line
+from benchmarks.studies.report._overall import overall
+from benchmarks.studies.report._scene import load
 
 HELP = "the page of all scenes, or of some, from results"
 OPTIONS = ("names", "runs")
+SHOWN = ("scene", "large", "network", "program")  # kinds of tasks
 
 
 def run(options: Namespace, folder: Path) -> None:
-    """Writes the page beside the folder, and prints its tables."""
-    from benchmarks.studies.report import _page
-
+    """Writes the page, and prints what it says of all scenes."""
     runs = folder.parent
     results = runs if options.runs else _study.COMMITTED
-    found = {name: load(name, results) for name in options.names or _registry.scenes()}
-    for name in (name for name, scene in found.items() if scene is None):
-        Console().print(f"{name} has no results: python -m benchmarks run {name}")
-    scenes = [scene for scene in found.values() if scene is not None]
-    if not scenes:
+    names = options.names or [n for n, of in _registry.tasks().items() if of.kind in SHOWN]
+    written = write(results, results if not options.names else runs, options.names)
+    for name in names:
+        if not (results / name / "results.json").exists():
+            Console().print(f"{name} has no results: python -m benchmarks run {name}")
+    if written is None:
         return
-    overall = overall_of(scenes)
-    _study.show([*(grid for scene in scenes for grid in _tables.of_scene(scene)), *overall])
-    runs.mkdir(parents=True, exist_ok=True)
-    written = runs / ("-".join(["report", *options.names]) + ".html")
-    written.write_text(_page.page(scenes, overall, results))
-    Console().print(f"Written to {written}, {written.stat().st_size / 1e6:.1f} MB")
+    scenes = [scene for name in names for scene in load(name, results)]
+    _study.show(overall(scenes))
+    Console().print(in_one_line(scenes), markup=False, highlight=False)
+    Console().print(f"The page: {written}, {written.stat().st_size / 1e6:.1f} MB", soft_wrap=True)
 
 
-def overall_of(scenes: Sequence[Scene]) -> list[Grid]:
-    """The tables of all scenes together."""
-    grids = [_tables.of_scenes(scenes), _tables.over(scenes, "all scenes")]
-    if len({scene.plateau for scene in scenes}) > 1:
-        for plateau, which in ((True, "scenes with plateaus"), (False, "scenes without")):
-            some = [scene for scene in scenes if scene.plateau == plateau]
-            grids.append(_tables.over(some, which))
-    return grids
+def write(results: Path, folder: Path, names: list[str]) -> Path | None:
+    """Writes the page of some tasks, or of all, by the folder of results; None where none ran."""
+    from benchmarks.studies.report import _page
+
+    shown = names or [n for n, of in _registry.tasks().items() if of.kind in SHOWN]
+    scenes = [scene for name in shown for scene in load(name, results)]
+    if not scenes:
+        return None
+    folder.mkdir(parents=True, exist_ok=True)
+    written = folder / ("-".join(["report", *names]) + ".html")
+    written.write_text(_page.page(scenes, results, whole=not names))
+    return written

@@ -1,63 +1,254 @@
-"""The page: HTML with everything in it, that a phone shows, a printer prints, and mail carries."""
+"""The page: HTML with everything in it, made by templates from results; it needs no other file."""
 
-import base64
-import io
+import math
+import re
 from collections.abc import Sequence
-from html import escape
-from importlib import import_module
+from functools import cache
 from pathlib import Path
+from typing import Any
 
-from PIL import Image
+import jinja2
+from markupsafe import Markup, escape
 
 from benchmarks import _atlas, _registry
-from benchmarks._grid import Grid, to_html
-from benchmarks._pictures import LABELS, ours_of, panel
-from benchmarks._study import committed
-from benchmarks._style import STYLE, looks, plt
-from benchmarks._summary import COSTS, unable
-from benchmarks.studies.report import _tables
-from benchmarks.studies.report._scene import ERRORS, OURS, RULE_TEXT, Scene, all_methods
+from benchmarks._grid import short
+from benchmarks._names import NAMES, name_of
+from benchmarks._reached import not_able, others, ranked, reached, took
+from benchmarks._summary import COSTS
+from benchmarks.studies.report import _chart, _finder
+from benchmarks.studies.report._compare import in_one_line, ratio
+from benchmarks.studies.report._overall import overall
+from benchmarks.studies.report._parts import Part, Sub, parts
+from benchmarks.studies.report._scene import RULE_TEXT, Scene
+from benchmarks.studies.report._standing import amount, first, loses
 
-CSS = Path(__file__).with_name("style.css").read_text()
-SIZE, DPI = (4.6, 3.3), 110  # of a panel: inches, and dots an inch
-COLOURS = 48  # of a picture: lines on white need no more
-SVG_DASHES = {"-": "", "--": "6 3", "-.": "6 2 1.5 2", (0, (1, 1)): "1.5 1.5"}
-OTHER_DASH = "7 1.5 1.5 1.5 1.5 1.5"
-PREAMBLE = (
-    "Every method sees the same black box and the same starts, and tells where it is after each "
-    "step. Image errors are measured on renders without noise, parameter errors against what is "
-    "sought; neither is charged to the method. Both are relative to the start's. Seconds are "
-    "without compilation. A gradient of Mitsuba's own costs two evaluations."
-)
-
-Look = dict[str, dict]
+TEMPLATES = Path(__file__).with_name("templates")
+SIX = 6  # lines that have a name
+NARROW, WIDE = 0.2, 50.0  # the ends of a bar: times as fast
+SCALE = {0.2: "5× worse", 1: "1×", 10: "10×", 50: "50× better"}
+IN_PROFILES = ("cma-es", "bobyqa", "dfo-ls", "nelder-mead")  # peers
+WORDS = {"evaluations": ("fewer", "more"), "seconds": ("faster", "slower")}
 
 
-def page(scenes: Sequence[Scene], overall: Sequence[Grid], results: Path) -> str:
-    """The whole page, which needs no other file.
+def page(scenes: Sequence[Scene], results: Path, whole: bool) -> str:
+    """The page of some scenes; with all that is beside them if it is the `whole`."""
+    beside = list(parts(results)) if whole else []
+    tables = Part("methods", "All methods together", [Sub("Tables", overall(scenes), open=True)])
+    return (
+        _environment()
+        .get_template("page.html")
+        .render(
+            css=Markup((TEMPLATES / "style.css").read_text()),
+            js=Markup((TEMPLATES / "page.js").read_text()),
+            names=NAMES,
+            finder=finder(scenes, {part.key for part in beside}),
+            summary=in_one_line(scenes),
+            rule=RULE_TEXT,
+            scenes=[of_scene(scene) for scene in scenes],
+            parts=[tables, *beside],
+            machines=sorted({_machine(scene) for scene in scenes}),
+        )
+    )
 
-    The folder of results is for what was found about savings and robustness.
-    """
-    look = _look(scenes)
-    swatches = {name: _swatch(line["color"], line["linestyle"]) for name, line in look.items()}
-    links = "".join(f'<a href="#{s.name}">{escape(s.name)}</a>' for s in scenes)
-    said = "; ".join(sorted({scene.about["command"] for scene in scenes}))
-    machines = "; ".join(sorted({_machine(scene) for scene in scenes}))
-    parts = [
-        "<!doctype html><html lang=en><head><meta charset=utf-8>",
-        '<meta name=viewport content="width=device-width,initial-scale=1">',
-        f"<title>Inverse rendering: every method side by side</title><style>{CSS}</style></head>",
-        "<body><h1>Inverse rendering without derivatives of the renderer: every method side by "
-        "side</h1>",
-        f"<p><b>{escape(RULE_TEXT)}</b></p><p>{PREAMBLE}</p>",
-        f"<p>Run by {escape(said)}. On {escape(machines)}.</p>",
-        f"<nav>{links}</nav>",
-        *(to_html(grid, swatches) for grid in overall),
-        *(_study(name, results) for name in ("savings", "robustness")),
-        *(_section(scene, look, swatches) for scene in scenes),
-        "</body></html>\n",
-    ]
-    return "\n".join(parts)
+
+@cache
+def _environment() -> jinja2.Environment:
+    loader = jinja2.FileSystemLoader(TEMPLATES)
+    strict: Any = jinja2.StrictUndefined
+    made = jinja2.Environment(
+        loader=loader, autoescape=True, undefined=strict, trim_blocks=True, lstrip_blocks=True
+    )
+    made.filters["code"] = _code
+    return made
+
+
+def _code(text: str) -> Markup:
+    """What stands between backticks, as code."""
+    return Markup(re.sub(r"`([^`]*)`", r"<code>\1</code>", str(escape(text))))
+
+
+def finder(scenes: Sequence[Scene], beside: set[str]) -> dict[str, Any]:
+    """What the first screen asks, and all its answers; `beside` are the parts of the page."""
+    size = {
+        "key": "size",
+        "asks": "My problem has",
+        "choices": [(size.key, size.name) for size in _finder.SIZES],
+        "ends": "parameters",
+    }
+    plateaus = {"key": "plateaus", "asks": "with", "choices": _finder.PLATEAUS.items(), "ends": ""}
+    seen = {"key": "seen", "asks": "and gives", "choices": _finder.SEEN.items(), "ends": ""}
+    found = [_answer(answer, "profiles" in beside) for answer in _finder.answers(scenes)]
+    scale = [(_place(times), label) for times, label in SCALE.items()]
+    groups = [size, plateaus, seen]
+    asked = {"peers": _finder.PEERS, "groups": groups, "answers": found}
+    return asked | {"one": _place(1), "scale": scale}
+
+
+def _answer(answer: _finder.Answer, profiles: bool) -> dict[str, Any]:
+    plateaus, seen = _finder.PLATEAUS[answer.plateaus], _finder.SEEN[answer.seen]
+    told: dict[str, Any] = {
+        "key": answer.key,
+        "peer": answer.peer,
+        "asked": f"{answer.size.name} parameters, {plateaus}, {seen}",
+    }
+    if not answer.pairs:
+        see = profiles and answer.peer.key in IN_PROFILES
+        return told | {"bars": [], "why_none": answer.why_none, "see": see}
+    count, (ours, theirs) = len(answer.pairs), answer.solved
+    a, b, c, d = answer.starts
+    return told | {
+        "ours": answer.ours,
+        "theirs": answer.peer.name,
+        "bars": [_bar(answer, cost) for cost in COSTS],
+        "solved": f"Solved: {answer.ours} {ours} of {count} ({a} of {b} starts), "
+        f"{answer.peer.name} {theirs} of {count} ({c} of {d}).",
+        "scenes": [(pair.scene.name, pair.scene.label) for pair in answer.pairs],
+    }
+
+
+def _bar(answer: _finder.Answer, cost: str) -> dict[str, Any]:
+    """How many times as fast, as a bar from one, in percent of the track."""
+    found = answer.tally(cost)
+    of = found.mean
+    bar: dict[str, Any] = {"cost": cost, "width": None, "interval": "", "low": None}
+    if of is None:
+        ours, theirs = answer.solved
+        only = answer.ours if ours else answer.peer.name
+        return bar | {"told": f"only {only} gets there" if ours or theirs else "neither gets there"}
+    better, worse = WORDS[cost]
+    times, word = (of.value, better) if of.value >= 1 else (1 / of.value, worse)
+    one, at = _place(1), _place(of.value)
+    kind = "win" if of.value >= 1 else "lose"
+    on = f"{of.scenes} scene{'s' * (of.scenes > 1)}"
+    if of.scenes > 1:
+        low, high = _place(of.low), _place(of.high)
+        bar |= {"low": low, "span": round(high - low, 1)}
+        on = f"[{of.low:.2g}, {of.high:.2g}], {on}"
+        kind = "even" if of.low < 1 < of.high else kind
+    elif answer.close(cost):
+        kind, on = "even", f"{on}, quartiles overlap"
+    bar |= {"left": min(one, at), "width": round(abs(at - one), 1), "kind": kind, "interval": on}
+    return bar | {"told": f"{times:.2g}× {word}"}
+
+
+def _place(times: float) -> float:
+    share = math.log(min(max(times, NARROW), WIDE) / NARROW) / math.log(WIDE / NARROW)
+    return round(100 * share, 1)
+
+
+def of_scene(scene: Scene) -> dict[str, Any]:
+    """All that the template says of a scene."""
+    named = _named(scene)
+    pictures = _pictures(scene)
+    results, chosen = scene.results, ("Start", "Reference", *named)
+    drawn = lambda error: (_chart.of_scene(scene, named, error, cost) for cost in COSTS)
+    curves = lambda error: [chart for chart in drawn(error) if chart is not None]
+    return {
+        "name": scene.name,
+        "label": scene.label,
+        "title": results["title"],
+        "about": _about(scene),
+        "told": _told(scene),
+        "notes": results["notes"],
+        "remark": results.get("remark", ""),
+        "number": _number(scene),
+        "rival": _rival(scene),
+        "cards": [pictures[k] for k in ("Start", scene.ours, "Reference") if k in pictures],
+        "pictures": [pictures[k] for k in ("Reference", "Start", *named) if k in pictures],
+        "more_pictures": [shown for key, shown in pictures.items() if key not in chosen],
+        "film": _film(scene),
+        "standing": [first(scene, cost) for cost in COSTS],
+        "loses": loses(scene),
+        "charts": curves("image_error"),
+        "more_charts": curves("parameter_error"),
+        "legend": [NAMES[name] for name in named],
+        "more_lines": len(scene.ran) > len(named),
+        "table": reached(results),
+        "lines": [line for line in (others(results), not_able(results)) if line],
+        "command": scene.about["command"],
+    }
+
+
+def _named(scene: Scene) -> list[str]:
+    """Six: ours, ours where one number is all that is known, the best, and the best peers."""
+    best = ranked(scene.results)
+    peers = [name for name in best if name in scene.peers]
+    known = [scene.ours, scene.with_one_number, best[0], *peers, *best]
+    return list(dict.fromkeys(name for name in known if name in NAMES))[:SIX]
+
+
+def _about(scene: Scene) -> str:
+    results, budget = scene.results, scene.results["budget"]
+    count = results["dimensions"]
+    starts = sorted({found["starts"] for found in scene.ran.values()})
+    return (
+        f"{count:,} parameter{'s' * (count != 1)}; {'' if scene.plateaus else 'no '}plateaus; "
+        f"ours here is {name_of(scene.ours or 'none')}; {' or '.join(map(str, starts))} starts; at "
+        f"most {budget['evaluations']:,} evaluations or {budget['seconds']:g} s a run."
+    )
+
+
+def _told(scene: Scene) -> list[str]:
+    """What its module says, beginning with what it says of this one."""
+    said = _registry.told(scene.entry)
+    own = [part for part in said if part.startswith(f"`{scene.task}`")]
+    return own + [part for part in said if part not in own]
+
+
+def _number(scene: Scene) -> str:
+    if scene.ours is None:
+        return ""
+    median = took(scene.ran[scene.ours], "evaluations").median
+    if math.isfinite(median):
+        return f"{amount(median, 'evaluations')} evaluations"
+    left = scene.ran[scene.ours]["final"]["image_error"]["median"]
+    return f"not solved: leaves {short(100 * left)} %"
+
+
+def _rival(scene: Scene) -> str:
+    """The best peer, and how many times as long it takes."""
+    best = scene.best_peer("evaluations")
+    if best is None or not (theirs := took(scene.ran[best], "evaluations")).reached:
+        return "no peer solves it"
+    times = ratio(took(scene.ran[scene.ours], "evaluations"), theirs) if scene.ours else None
+    so = f", {times:.2g}× as many" if times else ""
+    return f"{name_of(best)} {amount(theirs.median, 'evaluations')}{so}"
+
+
+def _pictures(scene: Scene) -> dict[str, dict[str, str]]:
+    """By method, "Start" and "Reference", what is shown and how far it is away."""
+    stored = _atlas.stored(scene.results, list(scene.ran))
+    if stored is None:
+        return {}
+    away = _atlas.differences(stored)
+    uri = lambda of: _atlas.data_uri(_atlas.png(of))
+    found = {"Reference": {"uri": uri(stored.reference), "away": "", "caption": "Reference"}}
+    found["Start"] = {"uri": uri(stored.start), "away": uri(away[""]), "caption": "Start"}
+    for name, picture in stored.found.items():
+        left = short(100 * scene.ran[name]["first"])
+        caption = f"{name_of(name, scene.ran[name]['title'])}: {left} % left"
+        found[name] = {"uri": uri(picture), "away": uri(away[name]), "caption": caption}
+    return found
+
+
+def _film(scene: Scene) -> list[dict[str, Any]]:
+    """What some methods had found after so many renders, a line for each."""
+    shot = scene.results.get("film")
+    if not shot:
+        return []
+    lines = []
+    for name, pictures in _atlas.frames(shot).items():
+        each = zip(shot["marks"], pictures, shot["errors"][name], strict=True)
+        frames = [
+            {
+                "uri": _atlas.data_uri(_atlas.png(picture)),
+                "away": "",
+                "caption": f"{name_of(name)} after {mark}: {short(100 * error)} % left",
+            }
+            for mark, picture, error in each
+        ]
+        lines.append({"name": name_of(name), "frames": frames})
+    return lines
 
 
 def _machine(scene: Scene) -> str:
@@ -65,112 +256,3 @@ def _machine(scene: Scene) -> str:
     known = [p for p in ("smoothdiff", "jax", "mitsuba") if p in machine["versions"]]
     packages = ", ".join(f"{p} {machine['versions'][p]}" for p in known)
     return f"{machine['cores']} cores of {machine['cpu']}, Python {machine['python']}, {packages}"
-
-
-def _section(scene: Scene, look: Look, swatches: dict[str, str]) -> str:
-    results = scene.results
-    budget = results["budget"]
-    parameters = f"{results['dimensions']:,} parameter{'s' * (results['dimensions'] != 1)}"
-    not_able = " ".join(f"{title}: {why}." for title, why in unable(results).items())
-    parts = [
-        f'<section id="{scene.name}"><h2>{escape(results["title"])}</h2>',
-        f"<p>{parameters}, sigma {results['sigma']:g}, at most {budget['evaluations']:,} "
-        f"evaluations or {budget['seconds']:g} s a run ({scene.about['setting']}). "
-        f"Ours here: {escape(scene.ours or 'none was run')}.</p>",
-        _told(scene.name),
-        f"<p>{escape(results['notes'])}.</p>" if results["notes"] else "",
-        f"<p class=remark>{escape(results['remark'])}</p>" if results.get("remark") else "",
-        _pictures(scene),
-        _curves(scene, look),
-        *(to_html(grid, swatches) for grid in _tables.of_scene(scene)),
-        f"<p>Not able: {escape(not_able)}</p>" if not_able else "",
-    ]
-    return "\n".join([*filter(None, parts), "</section>"])
-
-
-def _told(name: str) -> str:
-    """What the task says of itself: what is varied, what is left out and why."""
-    build = _registry.task(name).build
-    build = getattr(build, "func", build)  # of a partial
-    text = import_module(build.__module__).__doc__ or ""
-    paragraphs = (" ".join(part.split()) for part in text.strip().split("\n\n"))
-    return "".join(f"<p>{escape(paragraph)}</p>" for paragraph in paragraphs)
-
-
-def _pictures(scene: Scene) -> str:
-    pictures = _atlas.stored(scene.results, list(scene.ran))
-    if pictures is None:
-        return ""
-    away = _atlas.differences(pictures)
-    cards = [
-        _card("Reference", [pictures.reference]),
-        _card("Start", [pictures.start, away[""]]),
-    ]
-    for name in sorted(scene.ran, key=lambda name: name != scene.ours):
-        caption = f"{scene.ran[name]['title']}: {scene.ran[name]['first']:.2g}"
-        cards.append(_card(caption, [pictures.found[name], away[name]]))
-    return (
-        "<figure><figcaption>The first start: what each method found, how far it is from the "
-        "reference (white is as far as the start), and the image error that is left."
-        f"</figcaption><div class=pictures>{''.join(cards)}</div></figure>"
-    )
-
-
-def _card(caption: str, pictures: list) -> str:
-    shown = "".join(f'<img alt="" src="{_atlas.data_uri(_atlas.png(of))}">' for of in pictures)
-    kind = " class=single" if len(pictures) == 1 else ""
-    return f"<figure{kind}>{shown}<figcaption>{escape(caption)}</figcaption></figure>"
-
-
-def _look(scenes: Sequence[Scene]) -> Look:
-    """The same line for a method in every scene."""
-    ran = {name: found for scene in scenes for name, found in scene.ran.items()}
-    # a scene has few of ours: those that the rule names have colours of their own there
-    ours = sorted(ours_of(ran), key=lambda name: (*OURS, name).index(name))
-    return looks(all_methods(scenes), ours)
-
-
-def _swatch(color: str, linestyle) -> str:
-    """A piece of a method's line, as SVG."""
-    dash = SVG_DASHES.get(linestyle, OTHER_DASH)
-    return (
-        '<svg class=swatch viewBox="0 0 30 8" aria-hidden=true><line x1=0 y1=4 x2=30 y2=4 '
-        f'stroke="{color}" stroke-width=2.5 stroke-dasharray="{dash}"/></svg>'
-    )
-
-
-def _curves(scene: Scene, look: Look) -> str:
-    shown = "".join(
-        f'<img alt="{escape(LABELS[error])}, against {cost}" '
-        f'src="{_atlas.data_uri(_panel(scene, look, error, cost))}">'
-        for error in ERRORS
-        for cost in COSTS
-    )
-    starts = max(found["starts"] for found in scene.ran.values())
-    return (
-        f"<figure><figcaption>Medians over {starts} starts. Thick lines are ours; the one "
-        "that is compared has its quartiles. The tables name the lines.</figcaption>"
-        f"<div class=panels>{shown}</div></figure>"
-    )
-
-
-def _panel(scene: Scene, look: Look, error: str, cost: str) -> str:
-    """A picture that can be read on a phone, as a PNG of few colours."""
-    written, smaller = io.BytesIO(), io.BytesIO()
-    with plt.rc_context(STYLE):
-        drawn, axis = plt.subplots(figsize=SIZE)
-        panel(axis, scene.ran, look, error, cost, {scene.ours})
-        drawn.savefig(written, format="png", dpi=DPI)
-        plt.close(drawn)
-    with Image.open(written) as image:
-        image.convert("RGB").quantize(COLOURS).save(smaller, "png", optimize=True)
-    return base64.b64encode(smaller.getvalue()).decode()
-
-
-def _study(name: str, results: Path) -> str:
-    """The tables of a study of scenes, where it was run."""
-    found = committed(name, results)
-    if found is None:
-        return ""
-    shown = (to_html(grid, {}) for grid in _registry.studies()[name].tables(found))
-    return f"<h2>{name.capitalize()}</h2>" + "".join(shown)
