@@ -64,7 +64,7 @@ def aniso(full: bool) -> Descent:
         configurations=(adam(), PLAIN, SMOOTH, GUIDED, MEMORYLESS),
         rate=0.1,
         b1=0.9,
-        marks=(100, SOON, 1000, LATE),
+        marks=(SOON, LATE),
         pictured=(SOON, LATE),
         notes="Errors are relative to the start. The largest curvature is about 1.",
     )

@@ -37,14 +37,14 @@ def cube(full: bool) -> Descent:
         target=meshes.cube(48),
         distance=meshes.distance_to_cube,
         points=meshes.cube(6)[0],
-        views=views_around(10, 128 if full else 64),
-        marks=(100, 400) if full else (30, 120),
+        views=views_around(*(10, 128) if full else (8, 48)),
+        marks=(100, 400) if full else (30, 90),
         levels=(0.01, 0.005, 0.002),
     )
 
 
 def horns(full: bool) -> Descent:
-    number, size = (25, 128) if full else (10, 64)
+    number, size = (25, 128) if full else (8, 48)
     return _descent(
         "mesh-horns",
         full,
@@ -52,7 +52,7 @@ def horns(full: bool) -> Descent:
         distance=meshes.distance_to_horned,
         points=np.concatenate([meshes.TIPS, meshes.horned(2)[0]]),
         views=views_around(number, size),
-        marks=(100, 400) if full else (50, 200),
+        marks=(100, 400) if full else (100,),
         levels=(0.01, 0.005),
     )
 
@@ -113,7 +113,7 @@ def _descent(
             errors=errors, levels={"L1 error of the pictures": levels, "Hausdorff distance": ()}
         ),
         start=lambda seed: start,
-        seeds=5,
+        seeds=5 if full else 3,
         configurations=configurations(faces, marks[-1]),
         rate=0.06,
         b1=0.9,

@@ -2,7 +2,7 @@
 
 Twice: with noisy gradients, whose rays ask one place for its colour, and with cleaner ones, whose
 rays ask all that they pass. As in the paper, filters act on density and albedo each by itself. The
-paper's 3 passes on 64³ voxels reach a quarter of 32³.
+paper's 3 passes on 64³ voxels reach a third as far as on 24³.
 """
 
 from functools import cache, partial
@@ -25,7 +25,7 @@ MARKS = (25, 50)
 
 
 def build(full: bool) -> list[Task]:
-    size, views = (64, 32) if full else (32, 16)
+    size, views = (64, 32) if full else (24, 12)
     scales = {"levels": (1, 2, 3), "sigma_d": (0.03, 0.1, 0.3, 1.0, 3.0)}
     configurations = [
         adam(),
@@ -59,7 +59,7 @@ def build(full: bool) -> list[Task]:
                 },
             ),
             start=lambda seed: start(size),
-            seeds=5,
+            seeds=5 if full else 3,
             configurations=configurations,
             rate=0.04,
             marks=MARKS,

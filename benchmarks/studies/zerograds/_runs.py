@@ -18,6 +18,7 @@ from benchmarks._task import Budget, Method, Problem, Task, Y
 from benchmarks.methods import zerograds
 from benchmarks.methods._host_loop import run_by
 
+FLOOR = 1e-4  # of the error of the start: smaller ones count as that
 PLENTY = 3600.0  # seconds: what ends a run is its evaluations
 BUDGETS = {
     "brdf": 1000,

@@ -7,7 +7,7 @@ the time, from equally many evaluations. Those of the run, which the surrogate h
 on top. Both with the mean as a baseline and with the default, which is itself a fit to the samples.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -72,14 +72,14 @@ def _ratio(problem: Problem, solver: sd.ZeroGrads, baseline: str) -> Callable[..
     return ratio
 
 
-def table(results: dict[str, Any]) -> Grid:
+def tables(results: dict[str, Any]) -> Iterator[Grid]:
     """The medians."""
     rows = (
         Row(f"{name}, {title}", tuple(map(short, task[baseline][1])))
         for name, task in results["tasks"].items()
         for baseline, title in BASELINES.items()
     )
-    return Grid(
+    yield Grid(
         "Control variate: how many times smaller a surrogate makes the gradient's variance",
         f"{results['samples']} evaluations an estimate, {results['repeats']} estimates, medians "
         f"over {results['starts']} starts, after so much of a run of ours.",

@@ -7,7 +7,7 @@ gradient is a difference along a diagonal with random signs. All three drive the
 Evaluations are steps times samples.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -132,7 +132,7 @@ def _true_gradient(problem: Problem) -> Callable[..., Float[Array, " n"]]:
     return lambda key, y, sigma: sd.smooth_grad(fun, sigma, **options)(key, y)
 
 
-def table(results: dict[str, Any]) -> Grid:
+def tables(results: dict[str, Any]) -> Iterator[Grid]:
     """The medians over a run."""
     rows = []
     for name, task in results["tasks"].items():
@@ -140,7 +140,7 @@ def table(results: dict[str, Any]) -> Grid:
             medians = (short(float(np.median(task[gradient][row][1]))) for row in ROWS)
             rows.append(Row(f"{name}, {title}", tuple(medians)))
         rows[-1] = rows[-1]._replace(end=True)
-    return Grid(
+    yield Grid(
         "Gradients over a run: medians over the windows and starts",
         f"{results['starts']} starts, {WINDOWS} windows.",
         ("task, gradient", *ROWS.values()),

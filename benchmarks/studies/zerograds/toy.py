@@ -1,5 +1,6 @@
 """Fig. 4: a surrogate learns a function of one parameter near the parameter, which follows it."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -76,13 +77,13 @@ def measure(starts: int, folder: Path, fresh: bool) -> dict[str, Any]:
     return {"reference": REFERENCE, "frames": frames}
 
 
-def table(results: dict[str, Any]) -> Grid:
+def tables(results: dict[str, Any]) -> Iterator[Grid]:
     """Where the parameter is."""
     rows = []
     for frame in results["frames"]:
         values = (f"{frame[name]:.3f}" for name in ("y", "loss", "smoothed"))
         rows.append(Row(f"{frame['share']:.0%}", (str(frame["evaluations"]), *values)))
-    return Grid(
+    yield Grid(
         "Toy: a staircase with a wide plateau and a dip",
         f"The parameter that is sought is {results['reference']}.",
         ("share of the iterations", "evaluations", "parameter", "loss", "smoothed loss"),
