@@ -31,6 +31,7 @@ EPS = 1e-12  # less than any gradient here, so that only the direction and the f
 POINTS_A_DECADE = 10  # of iterations at which a run is looked at
 # the grid of all descents beside the rate: the decay of the first moment, and the power of
 # 1 - b2 = (1 - b1)^tie. 2 is that of Chang et al. 2024, section 5.1, 3 has (0.9, 0.999)
+LARGEST = 1 - 1e-6  # in float32 there is little between it and 1
 B1S, TIES = (0.0, 0.2, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99), (1, 2, 3, 4)
 
 
@@ -163,7 +164,7 @@ Known: TypeAlias = tuple[tuple[str, int], ...]
 def _split(settings: Settings) -> tuple[Known, dict[str, float]]:
     """What is known when it is compiled, and what is traced."""
     given = {"b1": 0.0, "tie": 2} | settings
-    given["b2"] = 1 - (1 - given["b1"]) ** given.pop("tie")
+    given["b2"] = min(1 - (1 - given["b1"]) ** given.pop("tie"), LARGEST)
     known = tuple((name, value) for name, value in given.items() if isinstance(value, int))
     return known, {name: value for name, value in given.items() if not isinstance(value, int)}
 

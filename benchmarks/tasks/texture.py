@@ -86,7 +86,7 @@ def descent(size: int, configurations: tuple[Configuration, ...], **named: Any) 
             errors=errors, levels={"image error": (0.1, 0.03, 0.01), "roughness error": ()}
         ),
         start=lambda seed: start,
-        seeds=5,
+        seeds=5 if size > 64 else 3,
         configurations=configurations,
         rate=0.03,
         marks=MARKS,

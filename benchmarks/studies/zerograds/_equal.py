@@ -5,7 +5,7 @@ the budget is spent, both falling linearly; the rate at the start is what is tun
 """
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ import optax
 from benchmarks._kept import fingerprint, kept
 from benchmarks._task import Problem, Task
 from benchmarks._tuning import Best, Rates, Settings, geometric_mean, seeds, walk
-from benchmarks.studies.zerograds._runs import FLOOR, SOURCE, about
+from benchmarks.studies.zerograds._runs import FLOOR, about
 
 
 class Schedule(NamedTuple):
@@ -29,7 +29,8 @@ class Schedule(NamedTuple):
 
 SCHEDULES = {"constant": Schedule(1.0, 1.0), "annealed": Schedule(0.1, 0.02)}
 RATES = Rates(0.15, 3.0)  # in units of sigma
-TOGETHER = 5  # starts that one call of the program is for, and on which rates are tuned
+TOGETHER = 2  # starts that one call of the program is for
+TUNED_ON = 4  # starts
 
 Make = Callable[[Problem, optax.Schedule, optax.GradientTransformation], Any]
 
@@ -41,26 +42,34 @@ class Program:
         task: The task.
         name: Of the method, in names of files.
         make: (problem, sigma, optimiser) -> solver, both schedules being functions of the step.
-        source: What else the runs depend on.
         folder: Keeps what has been run.
         fresh: Run it again.
     """
 
-    def __init__(
-        self, task: Task, name: str, make: Make, source: str, folder: Path, fresh: bool = False
-    ):
+    def __init__(self, task: Task, name: str, make: Make, folder: Path, fresh: bool = False):
         self._task, self._folder = task, folder / "equal" / task.name
         self._name, self._fresh, self._points = name, fresh, about(task)["evaluations"]
         losses = [float(task.exact_loss(y)) for y in (task.start(0), task.score.reference)]
-        said = task.problem.budget, task.problem.sigma, losses, self._points
-        self._source = fingerprint(SOURCE, Path(__file__).read_text(), source, said)
-        self._compiled = jax.jit(jax.vmap(partial(_errors, task, make, self._points), (0, 0, None)))
+        together = jax.jit(jax.vmap(partial(_errors, task, make, self._points), (0, 0, None)))
+        self._lowered = together.lower(*self._given([0], 1.0, Schedule(1.0, 1.0)))
+        self._source = fingerprint(self._lowered.as_text(), losses)
+
+    @cached_property
+    def _compiled(self) -> Callable[..., jax.Array]:
+        return self._lowered.compile()
+
+    def _given(self, starts: list[int], rate: float, schedule: Schedule) -> tuple[Any, ...]:
+        """What the program takes, which has one shape."""
+        padded = starts + starts[-1:] * (TOGETHER - len(starts))
+        ys = jnp.stack([self._task.start(seed) for seed in padded])
+        keys = jnp.stack([jax.random.key(seed) for seed in padded])
+        return ys, keys, tuple(map(jnp.asarray, (rate, *schedule)))
 
     def tuned(self, schedule: str) -> Best:
         """The best rate of a schedule, on starts that are not scored, by the error at the end."""
 
         def cost(settings: Settings) -> float:
-            errors = self(schedule, settings["rate"], seeds(TOGETHER))
+            errors = self(schedule, settings["rate"], seeds(TUNED_ON))
             return geometric_mean(errors[:, -1].tolist(), FLOOR)
 
         return walk(cost, {"rate": RATES}, {"rate": RATES.first})
@@ -76,10 +85,7 @@ class Program:
         return np.concatenate(rows)
 
     def _run(self, schedule: str, rate: float, starts: list[int]) -> dict[str, np.ndarray]:
-        padded = starts + starts[-1:] * (TOGETHER - len(starts))  # the program has one shape
-        ys = jnp.stack([self._task.start(seed) for seed in padded])
-        keys = jnp.stack([jax.random.key(seed) for seed in padded])
-        found = self._compiled(ys, keys, (rate, *SCHEDULES[schedule]))
+        found = self._compiled(*self._given(starts, rate, SCHEDULES[schedule]))
         return {"errors": np.asarray(found, float)[: len(starts)]}
 
 

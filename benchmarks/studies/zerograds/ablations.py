@@ -89,8 +89,7 @@ def measure(starts: int, folder: Path, fresh: bool) -> dict[str, Any]:
         known = about(task)
         found: dict[str, Any] = {schedule: {} for schedule in SCHEDULES}
         for method, make in methods().items():
-            source = repr(CHANGES.get(method)) + Path(__file__).read_text() * (method != "ours")
-            program = Program(task, method, make, source, folder, fresh)
+            program = Program(task, method, make, folder, fresh)
             for schedule, of in found.items():
                 best = program.tuned(schedule)
                 rate = best.settings["rate"]
