@@ -32,7 +32,7 @@ POINTS_A_DECADE = 10  # of iterations at which a run is looked at
 # the grid of all descents beside the rate: the decay of the first moment, and the power of
 # 1 - b2 = (1 - b1)^tie. 2 is that of Chang et al. 2024, section 5.1, 3 has (0.9, 0.999)
 LARGEST = 1 - 1e-6  # in float32 there is little between it and 1
-B1S, TIES = (0.0, 0.2, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99), (1, 2, 3, 4)
+B1S, TIES = (0.0, 0.2, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995), (1, 2, 3, 4)
 
 
 class Configuration(NamedTuple):

@@ -30,7 +30,7 @@ class Schedule(NamedTuple):
 SCHEDULES = {"constant": Schedule(1.0, 1.0), "annealed": Schedule(0.1, 0.02)}
 RATES = Rates(0.15, 3.0)  # in units of sigma
 TOGETHER = 2  # starts that one call of the program is for
-TUNED_ON = 4  # starts
+TUNED_ON = 2  # starts
 
 Make = Callable[[Problem, optax.Schedule, optax.GradientTransformation], Any]
 
