@@ -20,8 +20,8 @@ from benchmarks.scenes import _monte_carlo, plate, smoke
 from benchmarks.tasks import lines, texture, volume
 
 
-def sgd(rate, b1, b2, *, slower=0):
-    return optax.sgd(rate * 0.1**slower)
+def sgd(rate, b1, b2, *, frozen=0):
+    return optax.sgd(rate * (1 - frozen))
 
 
 OPTIONS = Namespace(full=False, seeds=None, fresh=False, said="python -m benchmarks run bowl")
@@ -54,7 +54,7 @@ def bowl(name="bowl", high=np.inf):
         choose=choose,
         configurations=(
             Configuration("descent", "Gradient descent", sgd, remembers=False),
-            Configuration("both", "Two", sgd, {"slower": (0, 1)}, remembers=False),
+            Configuration("both", "Two", sgd, {"frozen": (0, 1)}, remembers=False),
             Configuration("adam", "Adam", partial(filtered, None)),
         ),
         rate=0.25,
@@ -73,8 +73,8 @@ def test_results_say_what_was_tuned_reached_and_drawn(tmp_path, monkeypatch):
     results = _study.write(_study.about(OPTIONS) | measured, tmp_path)
     configurations = results["tasks"]["one"]["configurations"]
     both = configurations["both"]["tuned"]["2"]
-    assert both["settings"] == {"rate": 1.0, "slower": 0}
-    assert both["ends"] == ["slower"]
+    assert both["settings"] == {"rate": 1.0, "frozen": 0}
+    assert both["ends"] == ["frozen"]
     assert configurations["descent"]["tuned"]["5"]["settings"] == {"rate": 1.0}
     assert set(configurations["adam"]["tuned"]["5"]["settings"]) == {"rate", "b1", "tie"}
     two = configurations["both"]
@@ -123,8 +123,9 @@ def test_all_configurations_have_one_grid_of_rates_and_decays():
     seen = {}
 
     def build(rate, b1, b2, *, levels, sigma):
-        seen.update(b1=float(b1), b2=float(b2), levels=levels, sigma=sigma)
-        return optax.sgd(1.0)
+        if not isinstance(b1, jax.core.Tracer):  # in the loop it is
+            seen.update(b1=float(b1), b2=float(b2), levels=levels, sigma=float(sigma))
+        return optax.sgd(rate)
 
     task = bowl()
     grids = [axes(task, each)[0] for each in task.configurations]
@@ -135,9 +136,7 @@ def test_all_configurations_have_one_grid_of_rates_and_decays():
     assert start == {"rate": 0.25, "b1": 0.5, "tie": 2, "levels": 2, "sigma": 1.0}
     assert {"rate", "b1", "tie"} < set(grid)
     how = method(task, configuration, start | {"b1": 0.9, "tie": 3}, (1,))
-    run = lambda how: how.prepare(task.problem)(task.start(0), jax.random.key(0), lambda *_: None)
-    with pytest.raises(jax.errors.ConcretizationTypeError):  # in the loop all else is traced
-        run(how)
+    how.prepare(task.problem)(task.start(0), jax.random.key(0), lambda *_: None)
     assert (seen["b1"], seen["levels"]) == (pytest.approx(0.9), 2)
     assert seen["b2"] == pytest.approx(0.999)
     assert how != method(task, configuration, start | {"b1": 0.9}, (1,))

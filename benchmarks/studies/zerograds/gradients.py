@@ -27,8 +27,8 @@ from benchmarks._grid import Grid, Row, short
 from benchmarks._kept import fingerprint, kept
 from benchmarks._summary import quarters
 from benchmarks._task import Problem, Task
-from benchmarks.methods import adam
-from benchmarks.studies.zerograds._runs import BUDGETS, SOURCE, Steps, curves, load, ours, panels
+from benchmarks.methods import adam, zerograds
+from benchmarks.studies.zerograds._runs import BUDGETS, SOURCE, Steps, curves, load, panels
 
 TASKS = ("rocket10", "led")
 WINDOWS = 20  # of a run: a variance and a cosine for each
@@ -61,7 +61,9 @@ def solver(name: str, problem: Problem) -> Any:
     """A solver whose optimiser has the last gradient as `opt_state[0]`."""
     keep = lambda optim: optax.chain(kept_gradient(), optim)
     if name == "ours":
-        return eqx.tree_at(lambda solver: solver.optimizer, ours(problem), replace_fn=keep)
+        return eqx.tree_at(
+            lambda solver: solver.optimizer, zerograds.solver(problem), replace_fn=keep
+        )
     found = adam.fr22_solver(problem, Signs if name == "spsa" else sd.Gaussian)
     return eqx.tree_at(lambda solver: solver.optim, found, replace_fn=keep)
 

@@ -13,7 +13,8 @@ import smoothdiff as sd
 from benchmarks._grid import Grid, Row
 from benchmarks._style import COLOURS
 from benchmarks._task import Budget, Problem
-from benchmarks.studies.zerograds._runs import PLENTY, Steps, ours, panels
+from benchmarks.methods import zerograds
+from benchmarks.studies.zerograds._runs import PLENTY, Steps, panels
 from smoothdiff.surrogates import MLP
 
 SHOWN = (0.0, 0.1, 0.35, 1.0)  # of the iterations, as in the paper
@@ -52,7 +53,7 @@ def measure(starts: int, folder: Path, fresh: bool) -> dict[str, Any]:
         sigma=SIGMA,
         budget=Budget(BUDGET, PLENTY),
     )
-    solver = ours(problem, surrogate=MLP(1, key=jax.random.key(1)))
+    solver = zerograds.solver(problem, surrogate=MLP(1, key=jax.random.key(1)))
     steps = Steps(solver, problem)
     along = steps.at(SHOWN, jnp.asarray(START, jnp.float32), jax.random.key(0))
     frames = []
