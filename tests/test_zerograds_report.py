@@ -153,7 +153,9 @@ def test_starts_of_every_part_are_what_was_asked_for(monkeypatch, tmp_path):
     part = SimpleNamespace(measure=lambda starts, folder, fresh: {"runs": (starts, fresh)})
     monkeypatch.setattr(zerograds, "PARTS", {"one": part, "other": part})
     for seeds, starts in ((3, 3), (None, zerograds.SEEDS)):
-        found = zerograds.measure(Namespace(names=[], seeds=seeds, fresh=True), tmp_path)
+        found = zerograds.measure(
+            Namespace(names=[], methods=None, seeds=seeds, fresh=True), tmp_path
+        )
         each = {"starts": starts, "runs": (starts, True)}
         assert found == {"one": each, "other": each}
 
@@ -226,10 +228,10 @@ def test_the_published_network_has_an_activated_output(key):
 def test_parts_are_chosen_by_name(tmp_path, monkeypatch):
     part = SimpleNamespace(measure=lambda starts, folder, fresh: {"runs": starts})
     monkeypatch.setattr(zerograds, "PARTS", {"one": part, "other": part})
-    options = Namespace(names=["other"], seeds=3, fresh=False)
+    options = Namespace(names=["other"], methods=None, seeds=3, fresh=False)
     assert zerograds.measure(options, tmp_path) == {"other": {"starts": 3, "runs": 3}}
     with pytest.raises(SystemExit, match="choose from one, other"):
-        zerograds.measure(Namespace(names=["none"], seeds=3, fresh=False), tmp_path)
+        zerograds.measure(Namespace(**vars(options) | {"names": ["none"]}), tmp_path)
 
 
 def test_signs_are_directions_of_unit_variance(key):
@@ -328,7 +330,9 @@ def test_it_runs_and_resumes(monkeypatch, of_slope, tmp_path):
     monkeypatch.setattr(gradients, "TITLES", {"fr22": "FR22"})
     monkeypatch.setattr(samples, "NUMBERS", {"slope": (4,)})
     monkeypatch.setattr(replay, "TITLES", {"0": "none"})
-    _study.run(zerograds, Namespace(said="a test", names=[], seeds=1, fresh=False), tmp_path)
+    _study.run(
+        zerograds, Namespace(said="a test", names=[], methods=None, seeds=1, fresh=False), tmp_path
+    )
     assert {path.stem for path in tmp_path.glob("*.png")} == set(parts)
 
     files = lambda: {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npz")}

@@ -9,7 +9,7 @@ An ablation is ours with one setting changed; `published` is ZeroGrads with the 
 fits: leaky ReLU, also at the output, three fits to each batch, nothing seen again.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -81,14 +81,17 @@ def methods() -> dict[str, Make]:
     return changed | {"fd": fd, "fr22": fr22}
 
 
-def measure(starts: int, folder: Path, fresh: bool) -> dict[str, Any]:
-    """Curves and ratios of each task and schedule."""
+def measure(
+    starts: int, folder: Path, fresh: bool, only: Sequence[str] | None = None
+) -> dict[str, Any]:
+    """Curves and ratios of each task and schedule, of all rows or only some."""
     tasks = {}
+    rows = {name: make for name, make in methods().items() if only is None or name in only}
     for name in BUDGETS:
         task = load(name)
         known = about(task)
         found: dict[str, Any] = {schedule: {} for schedule in SCHEDULES}
-        for method, make in methods().items():
+        for method, make in rows.items():
             program = Program(task, method, make, folder, fresh)
             for schedule, of in found.items():
                 best = program.tuned(schedule)
