@@ -8,7 +8,7 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -19,32 +19,39 @@ import optax
 import smoothdiff as sd
 from benchmarks._kept import fingerprint
 from benchmarks._task import Budget, Key, Method, Problem, Record, Solve, Task, Y
+from benchmarks._tuning import Axis, Rates, Settings
 
 Rate: TypeAlias = Any  # a number, traced or not
 Scene: TypeAlias = Any  # a pytree of arrays
-Optimiser: TypeAlias = Callable[[Rate], optax.GradientTransformation]
 Filter: TypeAlias = Callable[[Any, Any], Any]
-Build: TypeAlias = Callable[[float, float, Any, Rate], optax.GradientTransformation]
+Build: TypeAlias = Callable[..., optax.GradientTransformation]
 Pictures: TypeAlias = Mapping[str, Any]  # arrays: (n,) a line, (H, W) grey, (H, W, 3) linear RGB
 
 EPS = 1e-12  # less than any gradient here, so that only the direction and the filters count
 POINTS_A_DECADE = 10  # of iterations at which a run is looked at
+# the grid of all descents beside the rate: the decay of the first moment, and the power of
+# 1 - b2 = (1 - b1)^tie. 2 is that of Chang et al. 2024, section 5.1, 3 has (0.9, 0.999)
+LARGEST = 1 - 1e-6  # in float32 there is little between it and 1
+B1S, TIES = (0.0, 0.2, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995), (1, 2, 3, 4)
 
 
 class Configuration(NamedTuple):
-    """A way to descend, in one or more variants that are tuned like the learning rate.
+    """A way to descend, whose settings are tuned.
 
     Args:
         name: In names of files.
         title: In tables and figures.
-        variants: Optimisers by name, each a function of the learning rate, which may be traced.
-        tuned_at: The iteration whose error the tuning makes least; None is the last one.
+        build: (rate, b1, b2, **others) -> an optimiser. Settings that are whole numbers are known
+            when it is compiled, all others are traced.
+        axes: What is tuned beside rate, b1 and b2, and its values in their order.
+        remembers: With False b1 and b2 are zero.
     """
 
     name: str
     title: str
-    variants: Mapping[str, Optimiser]
-    tuned_at: int | None = None
+    build: Build
+    axes: Mapping[str, Sequence[Any]] = {}
+    remembers: bool = True
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -55,17 +62,20 @@ class Descent(Task):
 
     Args:
         configurations: Who is compared. The first is the one whose time others are compared with.
-        rates: The learning rates that every variant of every configuration is tried with.
-        marks: The iterations that tables show, rising; the last is the budget.
-        tuning_seeds: How many seeds each variant and rate is tried on.
+        rate: The learning rate that tuning begins with.
+        b1: Likewise.
+        marks: The iterations that tables show, rising; the last is the budget. A configuration is
+            tuned for each of them.
+        tuning_seeds: How many seeds settings are tried on.
         pictures: (y, scene) -> pictures by name, or None.
         target: scene -> the same pictures of what is sought, as far as there are any.
         pictured: The marks that pictures show; none means the last.
     """
 
     configurations: Sequence[Configuration]
-    rates: Sequence[float]
+    rate: float
     marks: Sequence[int]
+    b1: float = 0.5
     tuning_seeds: int = 2
     pictures: Callable[[Y, Scene], Pictures] | None = None
     target: Callable[[Scene], Pictures] = lambda scene: {}
@@ -98,37 +108,47 @@ def problem(
 
 
 def filtered(
-    b1: float, b2: float, filter: Filter | None, rate: Rate, where: Sequence[str] = ("postfilter",)
+    make: Callable[..., Filter] | None,
+    rate: Rate,
+    b1: Any,
+    b2: Any,
+    *,
+    where: Sequence[str] = ("postfilter",),
+    **strength: Any,
 ) -> optax.GradientTransformation:
-    """Adam with its moments filtered, or its gradients too; without a filter it is Adam."""
+    """Adam with its moments filtered by `make(**strength)`, or its gradients too; or Adam."""
+    filter = make(**strength) if make else None
     filters: dict[str, Any] = dict.fromkeys(where, filter)
     return sd.filtered_adam(rate, b1, b2, eps=EPS, **filters)
 
 
-def variants(
-    b1s: Sequence[float], filters: Mapping[str, Filter | None], build: Build = filtered
-) -> dict[str, Optimiser]:
-    """Each b1 with each filter, by name.
-
-    Rates of decay are tied as in Chang et al. 2024, section 5.1: 1 - b1 = sqrt(1 - b2).
-    """
-    return {
-        f"b1={b1:g} {name}".strip(): partial(build, b1, 1 - (1 - b1) ** 2, filter)
-        for b1 in b1s
-        for name, filter in filters.items()
-    }
+def adam() -> Configuration:
+    """Without any filter."""
+    return Configuration("adam", "Adam", partial(filtered, None))
 
 
-def methods(descent: Descent, configuration: Configuration) -> dict[tuple[str, float], Method]:
-    """The methods that a configuration may be, by variant and rate."""
-    found, seen = {}, observed(descent.marks[-1], descent.marks)
-    for variant, optimiser in configuration.variants.items():
-        source = fingerprint(_program(descent, optimiser), seen)
-        for rate in descent.rates:
-            name = "-".join([configuration.name, *variant.split(), f"{rate:g}", source[:8]])
-            prepare = partial(_prepare, descent.marks, optimiser, rate)
-            found[variant, rate] = Method(name, configuration.title, prepare, source)
-    return found
+def axes(descent: Descent, configuration: Configuration) -> tuple[dict[str, Axis], Settings]:
+    """What is tuned of a configuration, and where that begins."""
+    found: dict[str, Axis] = {"rate": Rates(descent.rate)}
+    start: Settings = {"rate": descent.rate}
+    if configuration.remembers:
+        found |= {"b1": B1S, "tie": TIES}
+        start |= {"b1": descent.b1, "tie": 2}
+    middles = {name: of[len(of) // 2] for name, of in configuration.axes.items()}
+    return {**found, **configuration.axes}, {**start, **middles}
+
+
+def method(
+    descent: Descent, configuration: Configuration, settings: Settings, seen: Sequence[int]
+) -> Method:
+    """The method that a configuration is with settings, looked at after `seen` iterations."""
+    known, traced = _split(settings)
+    program = _program(descent, configuration.build, known, tuple(traced))
+    source = fingerprint(program, sorted(traced.items()), list(seen))
+    said = (f"{name}{value:g}" for name, value in settings.items())
+    name = "-".join([configuration.name, *said, source[:8]])
+    prepare = partial(_prepare, seen, (configuration.build, known), traced)
+    return Method(name, configuration.title, prepare, source)
 
 
 def observed(last: int, marks: Sequence[int]) -> list[int]:
@@ -138,23 +158,42 @@ def observed(last: int, marks: Sequence[int]) -> list[int]:
     return sorted({*points, *(mark for mark in marks if mark <= last)})
 
 
-def _prepare(marks: Sequence[int], optimiser: Optimiser, rate: float, problem: Problem) -> Solve:
+Known: TypeAlias = tuple[tuple[str, int], ...]
+
+
+def _split(settings: Settings) -> tuple[Known, dict[str, float]]:
+    """What is known when it is compiled, and what is traced."""
+    given = {"b1": 0.0, "tie": 2} | settings
+    given["b2"] = min(1 - (1 - given["b1"]) ** given.pop("tie"), LARGEST)
+    known = tuple((name, value) for name, value in given.items() if isinstance(value, int))
+    return known, {name: value for name, value in given.items() if not isinstance(value, int)}
+
+
+def _prepare(
+    seen: Sequence[int], of: tuple[Build, Known], traced: dict[str, float], problem: Problem
+) -> Solve:
+    build, known = of
+    # as arrays: a b1 that is the number 0 has a state of its own
+    given = {name: jnp.asarray(value) for name, value in traced.items()}
+
     def solve(y0: Y, key: Key, record: Record) -> None:
-        run = y0, optimiser(rate).init(y0)
-        inputs = rate, key, problem.scene(), problem.bounds
-        for first, last in itertools.pairwise([0, *observed(problem.budget.evaluations, marks)]):
-            run = _advance((optimiser, problem.gradient), run, inputs, first, last)
+        run = y0, build(**given, **dict(known)).init(y0)
+        inputs = given, key, problem.scene(), problem.bounds
+        for first, last in itertools.pairwise([0, *seen]):
+            run = _advance((build, known, problem.gradient), run, inputs, first, last)
             record(run[0], last)
 
     return solve
 
 
 @partial(jax.jit, static_argnums=0)
-def _advance(of: tuple[Optimiser, Callable], run: Any, inputs: Any, first: int, last: int) -> Any:
-    """From one iteration to another, within the bounds: one program for all rates and stretches."""
-    optimiser, gradient = of
-    rate, key, scene, bounds = inputs
-    transform = optax.with_extra_args_support(optimiser(rate))
+def _advance(
+    of: tuple[Build, Known, Callable], run: Any, inputs: Any, first: int, last: int
+) -> Any:
+    """From one iteration to another, within the bounds: one program for all that is traced."""
+    build, known, gradient = of
+    traced, key, scene, bounds = inputs
+    transform = optax.with_extra_args_support(build(**traced, **dict(known)))
 
     def step(i, run):
         y, state = run
@@ -165,9 +204,11 @@ def _advance(of: tuple[Optimiser, Callable], run: Any, inputs: Any, first: int, 
     return jax.lax.fori_loop(first, last, step, run)
 
 
-def _program(descent: Descent, optimiser: Optimiser) -> str:
+@cache
+def _program(descent: Descent, build: Build, known: Known, names: tuple[str, ...]) -> str:
     """What is compiled for an optimiser: changes when its runs would."""
-    y = descent.start(0)
-    run = y, optimiser(1.0).init(y)
-    inputs = 1.0, jax.random.key(0), descent.scene(0), descent.problem.bounds
-    return _advance.lower((optimiser, descent.problem.gradient), run, inputs, 0, 0).as_text()
+    y, traced = descent.start(0), {name: jnp.asarray(0.5) for name in names}
+    run = y, build(**traced, **dict(known)).init(y)
+    inputs = traced, jax.random.key(0), descent.scene(0), descent.problem.bounds
+    of = build, known, descent.problem.gradient
+    return _advance.lower(of, run, inputs, 0, 0).as_text()

@@ -1,10 +1,9 @@
 """Descents as a study: configurations are tuned and run, and what they reached is drawn and shown.
 
-Each is tuned over the same small grid of variants and learning rates, on seeds that are not
-scored, and is then run from the scored ones.
+Each is tuned by a walk on the same grid, on seeds that are not scored, once for every mark that is
+shown, and is then run from the scored ones.
 """
 
-import math
 from argparse import Namespace
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
@@ -20,15 +19,16 @@ from tqdm import tqdm
 
 from benchmarks import _loop, _registry
 from benchmarks._atlas import display
-from benchmarks._descent import Configuration, Descent, methods
+from benchmarks._descent import Configuration, Descent, axes, method, observed
 from benchmarks._grid import Grid, Row, spread
 from benchmarks._study import setting
 from benchmarks._style import COLOURS, band, figure, headed, legend, looks, panels
 from benchmarks._summary import cost_to_level, quartiles
-from benchmarks._task import Budget, Method, precision_of
+from benchmarks._task import precision_of
+from benchmarks._tuning import Best, Settings, geometric_mean, seeds, walk
 
-TUNING_SEED = 1000  # the first of those that are not scored
 FILES = {"iterations": "error-vs-iterations.png", "seconds": "error-vs-time.png"}
+EARLY = (1, 2, 3)  # iterations at which every run is looked at, so that warming up is short
 FLOOR = 1e-9  # the smallest error drawn, relative to the largest
 BRIGHTEST = 99  # percentile of a grey picture that is shown as white
 
@@ -39,6 +39,7 @@ def measure(name: str, options: Namespace, folder: Path, bar: tqdm | None = None
     The folder keeps the runs, and has pictures of what the first start found.
     """
     family = {task.name: task for task in _registry.family(name, options.full)}
+    bar = bar or tqdm(unit="run")  # how many a walk takes is not known
     how: dict[str, Any] = {"setting": setting(options), "fresh": options.fresh, "progress": bar}
     run = partial(_loop.run, folder=folder / "raw", **how)
     tasks = {}
@@ -55,99 +56,122 @@ def compared(
     task: Descent, starts: int, run: Callable[..., _loop.Runs], folder: Path
 ) -> dict[str, Any]:
     """What the results say of a task. What the first start found is drawn into a folder."""
-    choices = [tune(task, each, run) for each in task.configurations]
-    chosen, pictured = [method for method, _ in choices], task.pictured or task.marks[-1:]
-    found = _loop.able(run(task, chosen, range(starts), keep=pictured))
+    found, pictured = {}, task.pictured or task.marks[-1:]
+    firsts: dict[int, dict[str, Any]] = {mark: {} for mark in pictured}
+    for each in task.configurations:
+        choices = tune(task, each, run)
+        looked_at = observed(task.marks[-1], task.marks)
+        chosen = {m: method(task, each, of.settings, looked_at) for m, of in choices.items()}
+        runs = _loop.able(run(task, list(set(chosen.values())), range(starts), keep=pictured))
+        of_marks = {mark: runs[how] for mark, how in chosen.items()}
+        tuned = {mark: of._asdict() for mark, of in choices.items()}
+        found[each.name] = {"title": each.title, "tuned": tuned, **_of_runs(task, of_marks)}
+        for mark in pictured:
+            firsts[mark][each.title] = of_marks[mark][0][f"found {mark}"]
     for mark in pictured if task.pictures else ():
-        firsts = {method.title: runs[0][f"found {mark}"] for method, runs in found.items()}
-        _draw_found(task, firsts, folder / f"pictures-{mark}.png")
+        _draw_found(task, firsts[mark], folder / f"pictures-{mark}.png")
     return {
         "title": task.title,
         "notes": task.notes,
         "score": task.scored,
         "starts": starts,
         "tuning_seeds": task.tuning_seeds,
-        "configurations": {
-            each.name: {"title": each.title, **choice, **_of_runs(task, found[method])}
-            for each, (method, choice) in zip(task.configurations, choices, strict=True)
-        },
+        "configurations": found,
     }
 
 
 def tune(
     task: Descent, configuration: Configuration, run: Callable[..., _loop.Runs]
-) -> tuple[Method, dict[str, Any]]:
-    """The variant and the rate with the lowest error, the geometric mean over the tuning seeds.
+) -> dict[int, Best]:
+    """By mark, the settings with the lowest error there, a geometric mean over the tuning seeds."""
+    on, known = seeds(task.tuning_seeds), dict[str, dict[int, float]]()
 
-    Beside the method it gives what the results say of the choice.
-    """
-    budget = Budget(configuration.tuned_at or task.marks[-1], math.inf)
-    until = replace(task, problem=replace(task.problem, budget=budget))
-    candidates = methods(task, configuration)
-    seeds = range(TUNING_SEED, TUNING_SEED + task.tuning_seeds)
-    found = _loop.able(run(until, list(candidates.values()), seeds))
-    tried: dict[str, dict[float, float]] = {variant: {} for variant in configuration.variants}
-    for (variant, rate), method in candidates.items():
-        logs = [np.log(one[task.scored][-1]) for one in found[method]]
-        tried[variant][rate] = float(np.exp(np.mean(logs)))
-    variant, rate = min(candidates, key=lambda candidate: tried[candidate[0]][candidate[1]])
-    at_edge = rate in (task.rates[0], task.rates[-1])
-    choice = {"variant": variant, "rate": rate, "at_edge": at_edge, "tried": tried}
-    return candidates[variant, rate], choice
+    def errors(settings: Settings) -> dict[int, float]:
+        if repr(settings) not in known:
+            how = method(task, configuration, settings, (*EARLY, *task.marks))
+            runs = _loop.able(run(task, [how], on))[how]
+            at = {mark: list(runs[0]["evaluations"]).index(mark) for mark in task.marks}
+            left = {mark: [one[task.scored][i] for one in runs] for mark, i in at.items()}
+            known[repr(settings)] = {mark: geometric_mean(each) for mark, each in left.items()}
+        return known[repr(settings)]
+
+    grid, start = axes(task, configuration)
+    found: dict[int, Best] = {}
+    for mark in task.marks:
+        found[mark] = walk(lambda settings: errors(settings)[mark], grid, start)  # noqa: B023
+        start = found[mark].settings
+    return found
 
 
-def _of_runs(task: Descent, runs: list[_loop.Run]) -> dict[str, Any]:
-    """Errors at the iterations at which runs were looked at, and at the marks."""
-    iterations = runs[0]["evaluations"].tolist()
-    errors = {name: np.stack([run[name] for run in runs]) for name in task.score.levels}
+def _of_runs(task: Descent, of_marks: dict[int, list[_loop.Run]]) -> dict[str, Any]:
+    """Errors at the marks, each by the runs that were tuned for it; the rest is of the last."""
+    last = of_marks[task.marks[-1]]
+    iterations = last[0]["evaluations"].tolist()
+    stacked = lambda runs, name: np.stack([run[name] for run in runs])
+    errors = {name: stacked(last, name) for name in task.score.levels}
+    at = lambda mark, name: list(stacked(of_marks[mark], name)[:, iterations.index(mark)])
     took = lambda level: [cost_to_level(e, iterations, level) for e in errors[task.scored]]
     return {
         "iterations": iterations,
-        "seconds": np.median([run["seconds"] for run in runs], axis=0).tolist(),
+        "seconds": np.median([run["seconds"] for run in last], axis=0).tolist(),
         "curves": {
             name: np.quantile(each, [0.25, 0.5, 0.75], axis=0, method="higher").tolist()
             for name, each in errors.items()
         },
         "at_marks": {
-            name: {mark: quartiles(list(each[:, iterations.index(mark)])) for mark in task.marks}
-            for name, each in errors.items()
+            name: {mark: quartiles(at(mark, name)) for mark in task.marks} for name in errors
         },
         "to_levels": {level: quartiles(took(level)) for level in task.score.levels[task.scored]},
-        "ms_an_iteration": quartiles([1e3 * run["seconds"][-1] / iterations[-1] for run in runs]),
+        "ms_an_iteration": quartiles([1e3 * run["seconds"][-1] / iterations[-1] for run in last]),
     }
 
 
 def tables(results: dict[str, Any]) -> Iterator[Grid]:
-    """Of each task: errors at the marks, a table for each error, and what the levels took."""
+    """Of each task: errors at the marks, a table for each error, what was tuned, and levels."""
     for task in results["tasks"].values():
         configurations = list(task["configurations"].values())
         for error, marks in configurations[0]["at_marks"].items():
             shown = ((of["title"], of["at_marks"][error].values()) for of in configurations)
             yield Grid(
                 title=f"{task['title']}: {error}",
-                caption="Median [quartiles] over the starts, after so many iterations.",
+                caption="Median [quartiles] over the starts, after so many iterations; tuned for "
+                "each of them.",
                 columns=("configuration", *marks),
                 rows=tuple(Row(name, tuple(map(spread, found))) for name, found in shown),
             )
+        yield _of_tuning(task, configurations)
         yield _to_levels(task, configurations)
+
+
+def _of_tuning(task: dict[str, Any], configurations: list[dict[str, Any]]) -> Grid:
+    def said(choice: dict[str, Any]) -> str:
+        each = choice["settings"].items()
+        values = (f"{name} {value:g}{'*' * (name in choice['ends'])}" for name, value in each)
+        return ", ".join(values)
+
+    rows = (Row(of["title"], tuple(map(said, of["tuned"].values()))) for of in configurations)
+    return Grid(
+        title=f"{task['title']}: settings",
+        caption="By a walk on one grid, on other starts, for the error after so many iterations. "
+        "1 - b2 = (1 - b1)^tie; * is an end of its axis, natural for b1 0, tie 1 and levels 1.",
+        columns=("configuration", *configurations[0]["tuned"]),
+        rows=tuple(rows),
+        numbers=False,
+    )
 
 
 def _to_levels(task: dict[str, Any], configurations: list[dict[str, Any]]) -> Grid:
     usual = configurations[0]["ms_an_iteration"]["median"]
     rows = []
     for found in configurations:
-        edge = "*" if found["at_edge"] else ""
         extra = found["ms_an_iteration"]["median"] / usual - 1
-        levels = map(spread, found["to_levels"].values())
         time = spread(found["ms_an_iteration"]), f"{100 * extra:.0f} %"
-        cells = (*levels, f"{found['rate']:g}{edge}", found["variant"], *time)
-        rows.append(Row(found["title"], cells))
-    levels = configurations[0]["to_levels"]
+        rows.append(Row(found["title"], (*map(spread, found["to_levels"].values()), *time)))
     return Grid(
         title=f"Iterations until the {task['score']} is at most",
-        caption="The rate was tuned on other starts; * is the end of the grid. - is not reached. "
-        "Extra time is that of an iteration over the first line's.",
-        columns=("configuration", *levels, "rate", "variant", "ms/iteration", "extra time"),
+        caption="Tuned for the last mark. - is not reached. Extra time is that of an iteration "
+        "over the first line's.",
+        columns=("configuration", *configurations[0]["to_levels"], "ms/iteration", "extra time"),
         rows=tuple(rows),
     )
 
@@ -171,7 +195,10 @@ def _folder(folder: Path, name: str, family: Collection[str]) -> Path:
 
 
 def _curves(task: dict[str, Any], cost: str, path: Path) -> None:
-    """Median and quartiles over the starts, a panel for each error."""
+    """Median and quartiles over the starts, a panel for each error.
+
+    The line is of what was tuned for the last mark, the points are of what was tuned for theirs.
+    """
     configurations = task["configurations"]
     look = looks(configurations)
     names = list(next(iter(configurations.values()))["curves"])
@@ -181,11 +208,20 @@ def _curves(task: dict[str, Any], cost: str, path: Path) -> None:
                 costs = found[cost][1:]
                 errors = np.array(found["curves"][error], float)[:, 1:]
                 band(axis, costs, errors, look[name], found["title"])
+                if cost == "iterations":
+                    _mark(axis, found["at_marks"][error], look[name])
             bottom, top = axis.dataLim.intervaly
             axis.set(xscale="log", xlabel=cost.capitalize())
             axis.set(yscale="log", ylim=(max(bottom, FLOOR * top) / 1.3, 1.3 * top))
         legend(drawn, *axes[0, 0].get_legend_handles_labels())
         headed(drawn, f"{task['title']}\nMedian and quartiles over {task['starts']} starts")
+
+
+def _mark(axis: Any, marks: dict[str, Any], look: dict[str, Any]) -> None:
+    """The medians at the marks; what is not there has no point."""
+    medians = [(float(mark), found["median"]) for mark, found in marks.items()]
+    shown = [(mark, median) for mark, median in medians if median is not None]
+    axis.plot(*zip(*shown, strict=True), "o", ms=4, color=look["color"]) if shown else None
 
 
 def _draw_found(task: Descent, found: dict[str, np.ndarray], path: Path) -> None:

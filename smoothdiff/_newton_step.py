@@ -18,8 +18,8 @@ def newton_step(radius: PyTree) -> optax.GradientTransformationExtraArgs:
 
     Truncated conjugate gradients with products $H v$ by AD, so there is no array of n x n numbers,
     and an indefinite H does no harm. For the `optimizer` of `ZeroGrads`, where the products are
-    those of the surrogate and cost no evaluation. It has no curvature behind a leaky ReLU: take
-    `surrogates.MLP` with `activation=jax.nn.gelu`, or `surrogates.Quadratic`.
+    those of the surrogate and cost no evaluation. A surrogate of leaky ReLUs has no curvature: take
+    `surrogates.MLP` with its default activation, or `surrogates.Quadratic`.
 
     Args:
         radius: the longest step, in the units of the parameters: a number or a pytree like the

@@ -14,12 +14,16 @@ import pytest
 
 import smoothdiff as sd
 from benchmarks import _descents, _registry, _study
-from benchmarks._descent import Configuration, Descent, methods, problem, variants
+from benchmarks._descent import Configuration, Descent, axes, filtered, method, observed, problem
 from benchmarks._task import Score, Task, TaskEntry
 from benchmarks.scenes import _monte_carlo, plate, smoke
 from benchmarks.tasks import lines, texture, volume
 
-sgd: Any = optax.sgd
+
+def sgd(rate, b1, b2, *, frozen=0):
+    return optax.sgd(rate * (1 - frozen))
+
+
 OPTIONS = Namespace(full=False, seeds=None, fresh=False, said="python -m benchmarks run bowl")
 
 
@@ -28,7 +32,7 @@ def bowl(name="bowl", high=np.inf):
     scene = {"scene": jnp.arange(4.0)}
 
     def choose(seed):
-        scene["scene"] = seed + jnp.arange(4.0)
+        scene["scene"] = seed % 10 + jnp.arange(4.0)
         return scene["scene"]
 
     def gradient(y, key, scene):
@@ -49,16 +53,11 @@ def bowl(name="bowl", high=np.inf):
         seeds=2,
         choose=choose,
         configurations=(
-            Configuration("descent", "Gradient descent", {"": sgd}),
-            Configuration(
-                "both",
-                "Two variants",
-                {"slow": lambda rate: sgd(0.1 * rate), "fast": sgd},
-                tuned_at=2,
-            ),
-            Configuration("wild", "Wild", {"": lambda rate: sgd(1e30 * (rate - 1.0) + 1.0)}),
+            Configuration("descent", "Gradient descent", sgd, remembers=False),
+            Configuration("both", "Two", sgd, {"frozen": (0, 1)}, remembers=False),
+            Configuration("adam", "Adam", partial(filtered, None)),
         ),
-        rates=(0.1, 1.0, 3.0),
+        rate=0.25,
         marks=(2, 5),
         pictures=lambda y, scene: {"line": y["a"], "grey": jnp.outer(y["a"], y["a"])},
         target=lambda scene: {"line": scene},
@@ -73,24 +72,23 @@ def test_results_say_what_was_tuned_reached_and_drawn(tmp_path, monkeypatch):
     measured = _descents.measure("bowl", OPTIONS, tmp_path)
     results = _study.write(_study.about(OPTIONS) | measured, tmp_path)
     configurations = results["tasks"]["one"]["configurations"]
-    both = configurations["both"]
-    assert (both["variant"], both["rate"], both["at_edge"]) == ("fast", 1.0, False)
-    assert set(both["tried"]) == {"slow", "fast"}
-    assert both["to_levels"]["0.1"]["median"] == 1  # the first step of rate 1 gets there
-    assert both["to_levels"]["1e-09"]["median"] is None
-    assert both["at_marks"]["error"]["2"]["upper"] < 0.01
-    assert configurations["wild"]["rate"] == 1.0  # what diverges is never chosen
-    assert configurations["wild"]["tried"][""]["3.0"] is None
+    both = configurations["both"]["tuned"]["2"]
+    assert both["settings"] == {"rate": 1.0, "frozen": 0}
+    assert both["ends"] == ["frozen"]
+    assert configurations["descent"]["tuned"]["5"]["settings"] == {"rate": 1.0}
+    assert set(configurations["adam"]["tuned"]["5"]["settings"]) == {"rate", "b1", "tie"}
+    two = configurations["both"]
+    assert two["to_levels"]["0.1"]["median"] == 1  # the first step of rate 1 gets there
+    assert two["to_levels"]["1e-09"]["median"] is None
+    assert two["at_marks"]["error"]["2"]["upper"] < 0.01
 
     for grids in (_descents.tables(results), _descents.compare(results, results)):
-        assert [len(grid.rows) for grid in grids] == 2 * 3 * [len(configurations)]
+        assert [len(grid.rows) for grid in grids] == 2 * 4 * [len(configurations)]
     _descents.draw(results, tmp_path)
     for name in ("one/pictures-2", "other/error-vs-iterations", "other/error-vs-time"):
         assert (tmp_path / f"{name}.png").stat().st_size > 1000
 
     raw = sorted(tmp_path.glob("raw/*.npz"))
-    tuning, scored = 2 * 3 * (1 + 2 + 1), 2 * 3  # the tasks share their runs
-    assert len(raw) == tuning + scored
     assert {path.stem.split("-")[-2] for path in raw} == {"0", "1", "1000", "1001"}
     written = [path.stat().st_mtime_ns for path in raw]
     built.pop(0)
@@ -101,14 +99,15 @@ def test_results_say_what_was_tuned_reached_and_drawn(tmp_path, monkeypatch):
 
 def test_a_run_is_the_loop_that_optax_documents():
     """With bounds, at which it stays."""
-    momentum: Any = partial(optax.sgd, momentum=0.5)
-    task = replace(bowl(high=1.5), rates=(0.4,), marks=(5,))
+    momentum: Any = lambda rate, b1, b2: optax.sgd(rate, momentum=b1)
+    task = bowl(high=1.5)
     scene, found, key = task.scene(0), {}, jax.random.key(7)
-    [method] = methods(task, Configuration("m", "M", {"": momentum})).values()
+    settings = {"rate": 0.4, "b1": 0.5, "tie": 2}
+    how = method(task, Configuration("m", "M", momentum), settings, observed(5, (2, 5)))
     record = lambda y, iterations: found.update({iterations: y["a"]})
-    method.prepare(task.problem)(task.start(0), key, record)
+    how.prepare(task.problem)(task.start(0), key, record)
     y: Any = task.start(0)
-    transform = momentum(0.4)
+    transform = momentum(0.4, 0.5, None)
     state, gradient = transform.init(y), cast(Callable, task.problem.gradient)
     for i in range(5):
         slope = gradient(y, jax.random.fold_in(key, i), scene)
@@ -119,12 +118,28 @@ def test_a_run_is_the_loop_that_optax_documents():
     assert (found[5][2:] == 1.5).all()
 
 
-def test_variants_tie_the_rates_of_decay():
-    build: Any = lambda *arguments: arguments
-    found: Any = variants((0.2, 0.5), {"a": None, "b": None}, build)
-    assert list(found) == ["b1=0.2 a", "b1=0.2 b", "b1=0.5 a", "b1=0.5 b"]
-    b2s = [optimiser(0.1)[1] for optimiser in found.values()]
-    np.testing.assert_allclose(b2s, [0.36, 0.36, 0.75, 0.75])
+def test_all_configurations_have_one_grid_of_rates_and_decays():
+    """1 - b2 = (1 - b1)^tie; what is a whole number is known when it is compiled."""
+    seen = {}
+
+    def build(rate, b1, b2, *, levels, sigma):
+        if not isinstance(b1, jax.core.Tracer):  # in the loop it is
+            seen.update(b1=float(b1), b2=float(b2), levels=levels, sigma=float(sigma))
+        return optax.sgd(rate)
+
+    task = bowl()
+    grids = [axes(task, each)[0] for each in task.configurations]
+    assert grids[0] == {"rate": grids[2]["rate"]}
+    assert set(grids[2]) == {"rate", "b1", "tie"}
+    configuration = Configuration("c", "C", build, {"levels": (1, 2), "sigma": (0.5, 1.0)})
+    grid, start = axes(task, configuration)
+    assert start == {"rate": 0.25, "b1": 0.5, "tie": 2, "levels": 2, "sigma": 1.0}
+    assert {"rate", "b1", "tie"} < set(grid)
+    how = method(task, configuration, start | {"b1": 0.9, "tie": 3}, (1,))
+    how.prepare(task.problem)(task.start(0), jax.random.key(0), lambda *_: None)
+    assert (seen["b1"], seen["levels"]) == (pytest.approx(0.9), 2)
+    assert seen["b2"] == pytest.approx(0.999)
+    assert how != method(task, configuration, start | {"b1": 0.9}, (1,))
 
 
 def test_signals_are_piecewise_smooth():

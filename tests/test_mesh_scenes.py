@@ -146,7 +146,7 @@ def test_a_step_of_the_tasks_gets_closer(build):
         "laplacian-laplacian",
         "laplacian-bilateral",
     ]
-    optimiser = descent.configurations[1].variants[""](0.05)
+    optimiser = descent.configurations[1].build(0.05, 0.9, 0.99)
     updates, _ = optimiser.update(gradient, optimiser.init(start), start)
     before, after = errors(start, scene), errors(start + updates, scene)
     assert after[descent.scored] < before[descent.scored]

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 import smoothdiff as sd
@@ -16,6 +17,7 @@ from benchmarks._grid import to_rich
 from benchmarks._task import Budget, Problem, Score, Task, TaskEntry
 from benchmarks.studies import zerograds
 from benchmarks.studies.zerograds import (
+    _equal,
     _runs,
     ablations,
     control_variate,
@@ -24,6 +26,7 @@ from benchmarks.studies.zerograds import (
     samples,
     toy,
 )
+from benchmarks.studies.zerograds._equal import SCHEDULES
 from smoothdiff.surrogates import MLP
 
 
@@ -46,33 +49,42 @@ def slope(full: bool = False) -> Task:
     return Task("slope", "A slope", problem, Score(jnp.zeros(2)), start, seeds=1)
 
 
-def run_of(errors, evaluations=(0, 10, 20, 40)):
-    return {"evaluations": list(evaluations), "image_error": list(errors)}
+TASK = {"parameters": 3, "evaluations": [10, 20, 40]}
 
 
-TASK = {"parameters": 3, "evaluations": [10, 40]}
+def errors_of(*rows, rate=0.15):
+    return {"rate": rate, "tried": 4, "errors": np.array(rows)}
 
 
 def test_errors_are_compared_where_ours_is_down_to_a_twentieth():
-    runs = {
-        "ours": [run_of((1, 0.5, 0.04, 0.02)), run_of((1, 0.2, 0.03, 0.0))],
-        "fr22": [run_of((1, 0.8, 0.4, 0.2))] * 2,
+    found = {
+        "ours": errors_of((0.5, 0.04, 0.02), (0.2, 0.03, 0.0)),
+        "fr22": errors_of((0.8, 0.4, 0.2), (0.8, 0.4, 0.2), rate=0.45),
     }
-    found = ablations.compare(runs, TASK)
-    assert (found["at"], found["reached"]) == (20, True)
-    assert found["ratios"]["ours"] == 1
-    assert found["ratios"]["fr22"] == pytest.approx(0.4 / 0.035)
-    assert found["final"]["fr22"] == 0.2
-    assert found["curves"]["ours"][1] == pytest.approx([0.35, 0.01])
+    of = ablations.compare(found, TASK["evaluations"])
+    assert (of["at"], of["reached"]) == (20, True)
+    ours, fr22 = of["methods"]["ours"], of["methods"]["fr22"]
+    assert (ours["ratio"], ours["ratio_at_end"]) == (1, 1)
+    assert fr22["ratio"] == pytest.approx(0.4 / 0.035)
+    assert fr22["ratio_at_end"] == pytest.approx(0.2 / 0.01)
+    assert fr22["final"][1] == 0.2
+    assert fr22["rate"] == 0.45
+    assert ours["curve"][1] == pytest.approx([0.35, 0.035, 0.01])
 
-    found = ablations.compare({"ours": [run_of((1, 0.9, 0.8, 0.5))], "fr22": runs["fr22"]}, TASK)
-    assert (found["at"], found["reached"]) == (40, False)
-    assert found["ratios"]["fr22"] == pytest.approx(0.4)
+    found = {"ours": errors_of((0.9, 0.8, 0.5)), "fr22": found["fr22"]}
+    of = ablations.compare(found, TASK["evaluations"])
+    assert (of["at"], of["reached"]) == (40, False)
+    assert of["methods"]["fr22"]["ratio"] == pytest.approx(0.4)
 
 
-def test_what_is_solved_counts_as_a_thousandth():
-    runs = {"ours": [run_of((1, 0, 0, 0))], "fr22": [run_of((1, 1, 1, 1))]}
-    assert ablations.compare(runs, TASK)["ratios"]["fr22"] == pytest.approx(1000)
+def test_what_is_solved_counts_as_the_floor():
+    found = {"ours": errors_of((0, 0, 0)), "fr22": errors_of((1, 1, 1))}
+    of = ablations.compare(found, TASK["evaluations"])
+    assert of["methods"]["fr22"]["ratio"] == pytest.approx(1 / _runs.FLOOR)
+
+
+def run_of(errors, evaluations=(0, 10, 20, 40)):
+    return {"evaluations": list(evaluations), "image_error": list(errors)}
 
 
 def test_replay_is_read_where_the_error_is_down_to_a_tenth():
@@ -89,11 +101,13 @@ def test_all_parts_are_drawn_and_shown(monkeypatch, tmp_path):
     row = {name: [[1, 0, 1, 1], [2, 3, 2, 2], [2, 4, 2, 2]] for name in gradients.ROWS}
     along, line = {"evaluations": [5, 15, 25, 35]}, row["cosine"]
     of_replay = {name: replay.compare(runs, TASK["evaluations"]) for name in replay.TITLES}
+    each = errors_of((0.5, 0.1, 0.02))
+    compared = ablations.compare({"ours": each, "fr22": each}, TASK["evaluations"])
     frame = {"share": 0.5, "y": 0.3, "loss": 0.4, "sigma": 0.1, "smoothed": 0.35}
     frame |= {"evaluations": 80, "samples": [0.2, 0.4], "surrogate": [0.5, 0.3, 0.1]}
     parts = {
         "toy": {"reference": 0.75, "frames": [frame, frame | {"share": 1}]},
-        "ablations": {"tasks": {"led": ablations.compare({"ours": runs, "fr22": runs}, TASK)}},
+        "ablations": {"tasks": {"led": TASK | {"schedules": dict.fromkeys(SCHEDULES, compared)}}},
         "gradients": {"tasks": {"led": along | dict.fromkeys(gradients.TITLES, row)}},
         "samples": {
             "tasks": {
@@ -113,7 +127,9 @@ def test_all_parts_are_drawn_and_shown(monkeypatch, tmp_path):
     zerograds.draw(results, tmp_path)
     for name in parts:
         assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
-    shown = {grid.title.split(":")[0]: grid for grid in zerograds.tables(results)}
+    grids = list(zerograds.tables(results))
+    shown = {grid.title.split(":")[0]: grid for grid in grids}
+    assert len(grids) == len(parts) + len(SCHEDULES)
     for grid in shown.values():
         assert to_rich(grid).row_count == len(grid.rows) > 0
         assert all(len(row.cells) == len(grid.columns) - 1 for row in grid.rows)
@@ -137,21 +153,85 @@ def test_starts_of_every_part_are_what_was_asked_for(monkeypatch, tmp_path):
     part = SimpleNamespace(measure=lambda starts, folder, fresh: {"runs": (starts, fresh)})
     monkeypatch.setattr(zerograds, "PARTS", {"one": part, "other": part})
     for seeds, starts in ((3, 3), (None, zerograds.SEEDS)):
-        found = zerograds.measure(Namespace(seeds=seeds, fresh=True), tmp_path)
+        found = zerograds.measure(
+            Namespace(names=[], methods=None, seeds=seeds, fresh=True), tmp_path
+        )
         each = {"starts": starts, "runs": (starts, True)}
         assert found == {"one": each, "other": each}
 
 
-def test_ablations_are_ours_with_one_setting_changed():
-    usual = _runs.ours(slope().problem)
-    for name, changes in ablations.CHANGES.items():
-        solver = _runs.ours(slope().problem, **changes)
-        for setting in ("inner_sigma", "surrogate", "local", "num_samples", "replay"):
-            assert getattr(solver, setting) == changes.get(setting, getattr(usual, setting)), name
+def test_ablations_are_ours_with_some_settings_changed():
     methods = ablations.methods()
-    assert [method.name for method in methods] == [*ablations.CHANGES, "fd", "fr22"]
-    sources = {method.source for method in methods[: len(ablations.CHANGES)]}
-    assert len(sources) == len(ablations.CHANGES)
+    assert list(methods) == [*ablations.CHANGES, "fd", "fr22"]
+    made = {name: make(slope().problem, 0.5, optax.adam(0.1)) for name, make in methods.items()}
+    settings = ("inner_sigma", "surrogate", "surrogate_steps", "local", "num_samples", "replay")
+    for name, changes in ablations.CHANGES.items():
+        for setting in settings:
+            usual = getattr(made["ours"], setting)
+            assert getattr(made[name], setting) == changes.get(setting, usual), name
+    assert {solver.evaluations_per_step(jnp.zeros(2)) for solver in made.values()} == {2, 4}
+    assert {task for group in ablations.GROUPS.values() for task in group} == set(_runs.BUDGETS)
+
+
+def hill(full: bool = False) -> Task:
+    """A bowl in two parameters."""
+    problem = Problem(
+        loss=lambda y: jnp.sum(y**2),
+        bounds=(jnp.full(2, -9.0), jnp.full(2, 9.0)),
+        sigma=0.5,
+        budget=Budget(40, 100.0),
+    )
+    start = lambda seed: jnp.asarray([4.0, 5.0]) + seed
+    return Task("hill", "A hill", problem, Score(jnp.zeros(2), optimum=0.0), start, seeds=1)
+
+
+def test_a_program_is_adam_whose_rate_and_sigma_follow_the_schedule(tmp_path):
+    """Differences of a bowl have its slope, whatever sigma: Adam's own steps from there."""
+    task, fd = hill(), ablations.methods()["fd"]
+    program = _equal.Program(task, "fd", fd, tmp_path)
+    points, steps = _runs.about(task)["evaluations"], 40 // 4
+    for name, schedule in SCHEDULES.items():
+        found = program(name, 0.3, [1])[0]
+        rate = 0.3 * task.problem.sigma
+        optim = optax.adam(optax.linear_schedule(rate, schedule.rate * rate, steps))
+        y = task.start(1)
+        state, errors = optim.init(y), {0: 1.0}
+        for i in range(steps):
+            updates, state = optim.update(2 * y, state, y)
+            y = y + updates
+            errors[i + 1] = float(task.problem.loss(y) / task.problem.loss(task.start(1)))
+        np.testing.assert_allclose(found, [errors[at // 4] for at in points], rtol=1e-3)
+
+
+def test_a_program_is_tuned_on_other_starts_and_kept(tmp_path):
+    task, fr22 = hill(), ablations.methods()["fr22"]
+    program = _equal.Program(task, "fr22", fr22, tmp_path)
+    best = program.tuned("annealed")
+    files = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npz")}
+    assert {path.stem.split("-")[-2] for path in files} == {"1000", "1002"}
+    for rate in (best.settings["rate"] / 3, best.settings["rate"] * 3):
+        ends = program("annealed", rate, range(1000, 1004))[:, -1]
+        assert np.exp(np.log(ends).mean()) >= best.cost * (1 - 1e-6)
+    three, one = program("annealed", 0.45, [0, 1, 2]), program("annealed", 0.45, [2])
+    np.testing.assert_allclose(three[2], one[0], rtol=1e-6)  # whoever is beside it
+    again = _equal.Program(hill(), "fr22", fr22, tmp_path)
+    assert again.tuned("annealed") == best
+    assert all(path.stat().st_mtime_ns == when for path, when in files.items())
+
+
+def test_the_published_network_has_an_activated_output(key):
+    network, u = ablations.Published(2, key=key), jnp.ones(2)
+    raw = network.network(u)
+    assert network(u) == pytest.approx(float(jnp.where(raw > 0, raw, 0.01 * raw)))
+
+
+def test_parts_are_chosen_by_name(tmp_path, monkeypatch):
+    part = SimpleNamespace(measure=lambda starts, folder, fresh: {"runs": starts})
+    monkeypatch.setattr(zerograds, "PARTS", {"one": part, "other": part})
+    options = Namespace(names=["other"], methods=None, seeds=3, fresh=False)
+    assert zerograds.measure(options, tmp_path) == {"other": {"starts": 3, "runs": 3}}
+    with pytest.raises(SystemExit, match="choose from one, other"):
+        zerograds.measure(Namespace(**vars(options) | {"names": ["none"]}), tmp_path)
 
 
 def test_signs_are_directions_of_unit_variance(key):
@@ -245,11 +325,14 @@ def test_it_runs_and_resumes(monkeypatch, of_slope, tmp_path):
     monkeypatch.setattr(sd, "ZeroGrads", functools.partial(sd.ZeroGrads, **small))
     parts = {"ablations": ablations, "gradients": gradients, "samples": samples, "replay": replay}
     monkeypatch.setattr(zerograds, "PARTS", parts)
-    monkeypatch.setattr(ablations, "methods", lambda: [_runs.configuration("ours")])
+    fr22 = {"fr22": ablations.methods()["fr22"]}
+    monkeypatch.setattr(ablations, "methods", lambda: {"ours": fr22["fr22"]})
     monkeypatch.setattr(gradients, "TITLES", {"fr22": "FR22"})
     monkeypatch.setattr(samples, "NUMBERS", {"slope": (4,)})
     monkeypatch.setattr(replay, "TITLES", {"0": "none"})
-    _study.run(zerograds, Namespace(said="a test", seeds=1, fresh=False), tmp_path)
+    _study.run(
+        zerograds, Namespace(said="a test", names=[], methods=None, seeds=1, fresh=False), tmp_path
+    )
     assert {path.stem for path in tmp_path.glob("*.png")} == set(parts)
 
     files = lambda: {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npz")}

@@ -66,15 +66,17 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
     so a run does not depend on the scale of the function. Candidates for the point returned, beside
     the lowest that was evaluated, are the last iterate, the one of lowest estimate and the start.
 
-    The defaults are the paper's but for `replay` and what goes with it, the rate, the units,
-    and the network and `num_samples` in many dimensions. Its ablations are `inner_sigma=0`
+    The defaults are the paper's but for the network, `replay` and what goes with it, the rate, the
+    units, and `num_samples` in many dimensions. Its ablations are `inner_sigma=0`
     (NoSmooth), `surrogate=smoothdiff.surrogates.Quadratic` (NoNN) and `local=False` (NoLocal).
 
     Args:
         sigma: the width of the neighbourhood in which the surrogate is fitted, the paper's outer
             sigma, in the units of the parameters: a number, a pytree like the parameters, or an
             optax schedule, a function from the number of the step to a number. The paper has 0.33
-            of the domain, 0.025 for the weights of networks and for textures.
+            of the domain, 0.025 for the weights of networks and for textures, and keeps it. With
+            few parameters let it fall, and the rate too, see below: a constant one ends about as
+            far away as it is wide. With many keep it: the surrogate does not learn so fast.
         surrogate: called as `surrogate(size, key=key)`, gives an `eqx.Module` that takes a vector
             of `size` numbers and returns one: `surrogates.MLP`, or with other settings
             `functools.partial(surrogates.MLP, width=32)`. Or a module that is already made.
@@ -92,7 +94,9 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
         optimizer: an optax transformation for the parameters. It may ask for `value`, `grad` and
             `value_fn`, those of the surrogate in units of the first batch's mean deviation, so line
             searches cost no evaluation. By default Adam with a rate of 5 % of sigma. Most of the
-            paper's are 0.3 % to 0.5 %: slower, and closer in the end.
+            paper's are 0.3 % to 0.5 %: slower, and closer in the end. For few parameters and n
+            steps, `optax.adam(optax.linear_schedule(0.15 * s, 0.003 * s, n))` goes well with
+            `sigma=optax.linear_schedule(s, 0.1 * s, n)`.
         up_to_constant: fit only how the values of a batch differ from one another, which is all
             that a gradient needs. By default for more than 50 parameters; for fewer, and in the
             paper, it is the values themselves, which replayed batches need to tell of curvature.

@@ -8,7 +8,6 @@ from typing import Any
 
 import jax
 import numpy as np
-import optax
 
 import smoothdiff as sd
 from benchmarks import _registry, _style
@@ -18,6 +17,7 @@ from benchmarks._task import Budget, Method, Problem, Task, Y
 from benchmarks.methods import zerograds
 from benchmarks.methods._host_loop import run_by
 
+FLOOR = 1e-4  # of the error of the start: smaller ones count as that
 PLENTY = 3600.0  # seconds: what ends a run is its evaluations
 BUDGETS = {
     "brdf": 1000,
@@ -40,17 +40,11 @@ def load(name: str) -> Task:
     return dataclasses.replace(task, problem=problem)
 
 
-def ours(
-    problem: Problem, num_samples: int = zerograds.NUM_SAMPLES, **changes: Any
-) -> sd.ZeroGrads:
-    """ZeroGrads as the benchmarks have it, but for `changes`."""
-    optim = optax.adam(zerograds.rate(problem, num_samples))
-    return sd.ZeroGrads(problem.sigma, num_samples=num_samples, optimizer=optim, **changes)
-
-
 def configuration(name: str, **changes: Any) -> Method:
     """Ours, but for `changes`, as a method."""
-    prepare = lambda problem: run_by(sd.minimise, problem, problem.loss, ours(problem, **changes))
+    prepare = lambda problem: run_by(
+        sd.minimise, problem, problem.loss, zerograds.solver(problem, **changes)
+    )
     source = _registry.method("zerograds").source + SOURCE + repr(sorted(changes.items()))
     return Method(name, name, prepare, source)
 

@@ -7,7 +7,7 @@ the time, from equally many evaluations. Those of the run, which the surrogate h
 on top. Both with the mean as a baseline and with the default, which is itself a fit to the samples.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,8 @@ import smoothdiff as sd
 from benchmarks._grid import Grid, Row, short
 from benchmarks._summary import quarters
 from benchmarks._task import Problem, Task
-from benchmarks.studies.zerograds._runs import BUDGETS, Steps, curves, load, ours, panels
+from benchmarks.methods import zerograds
+from benchmarks.studies.zerograds._runs import BUDGETS, Steps, curves, load, panels
 
 TASKS = ("rocket10", "led")
 SHARES = (0.05, 0.25, 0.5, 1.0)  # of a run: where gradients are looked at
@@ -45,7 +46,7 @@ def measure(starts: int, folder: Path, fresh: bool) -> dict[str, Any]:
 
 def along(task: Task, seed: int) -> dict[str, list[float]]:
     """How many times smaller the variance is at several times of a run."""
-    solver = ours(task.problem)
+    solver = zerograds.solver(task.problem)
     steps, key = Steps(solver, task.problem), jax.random.key(seed)
     ratios = {name: jax.jit(_ratio(task.problem, solver, name)) for name in BASELINES}
     found: dict[str, list[float]] = {name: [] for name in BASELINES}
@@ -72,14 +73,14 @@ def _ratio(problem: Problem, solver: sd.ZeroGrads, baseline: str) -> Callable[..
     return ratio
 
 
-def table(results: dict[str, Any]) -> Grid:
+def tables(results: dict[str, Any]) -> Iterator[Grid]:
     """The medians."""
     rows = (
         Row(f"{name}, {title}", tuple(map(short, task[baseline][1])))
         for name, task in results["tasks"].items()
         for baseline, title in BASELINES.items()
     )
-    return Grid(
+    yield Grid(
         "Control variate: how many times smaller a surrogate makes the gradient's variance",
         f"{results['samples']} evaluations an estimate, {results['repeats']} estimates, medians "
         f"over {results['starts']} starts, after so much of a run of ours.",

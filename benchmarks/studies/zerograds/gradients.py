@@ -7,7 +7,7 @@ gradient is a difference along a diagonal with random signs. All three drive the
 Evaluations are steps times samples.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -27,8 +27,8 @@ from benchmarks._grid import Grid, Row, short
 from benchmarks._kept import fingerprint, kept
 from benchmarks._summary import quarters
 from benchmarks._task import Problem, Task
-from benchmarks.methods import adam
-from benchmarks.studies.zerograds._runs import BUDGETS, SOURCE, Steps, curves, load, ours, panels
+from benchmarks.methods import adam, zerograds
+from benchmarks.studies.zerograds._runs import BUDGETS, SOURCE, Steps, curves, load, panels
 
 TASKS = ("rocket10", "led")
 WINDOWS = 20  # of a run: a variance and a cosine for each
@@ -61,7 +61,9 @@ def solver(name: str, problem: Problem) -> Any:
     """A solver whose optimiser has the last gradient as `opt_state[0]`."""
     keep = lambda optim: optax.chain(kept_gradient(), optim)
     if name == "ours":
-        return eqx.tree_at(lambda solver: solver.optimizer, ours(problem), replace_fn=keep)
+        return eqx.tree_at(
+            lambda solver: solver.optimizer, zerograds.solver(problem), replace_fn=keep
+        )
     found = adam.fr22_solver(problem, Signs if name == "spsa" else sd.Gaussian)
     return eqx.tree_at(lambda solver: solver.optim, found, replace_fn=keep)
 
@@ -132,7 +134,7 @@ def _true_gradient(problem: Problem) -> Callable[..., Float[Array, " n"]]:
     return lambda key, y, sigma: sd.smooth_grad(fun, sigma, **options)(key, y)
 
 
-def table(results: dict[str, Any]) -> Grid:
+def tables(results: dict[str, Any]) -> Iterator[Grid]:
     """The medians over a run."""
     rows = []
     for name, task in results["tasks"].items():
@@ -140,7 +142,7 @@ def table(results: dict[str, Any]) -> Grid:
             medians = (short(float(np.median(task[gradient][row][1]))) for row in ROWS)
             rows.append(Row(f"{name}, {title}", tuple(medians)))
         rows[-1] = rows[-1]._replace(end=True)
-    return Grid(
+    yield Grid(
         "Gradients over a run: medians over the windows and starts",
         f"{results['starts']} starts, {WINDOWS} windows.",
         ("task, gradient", *ROWS.values()),

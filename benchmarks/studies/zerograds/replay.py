@@ -4,7 +4,7 @@ Ours with 100 batches and with none, all else as it is for a task of its size: w
 parameters the former is the default, beyond it the latter.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -50,14 +50,14 @@ def compare(runs: list[Run], evaluations: Sequence[int]) -> dict[str, Any]:
     }
 
 
-def table(results: dict[str, Any]) -> Grid:
+def tables(results: dict[str, Any]) -> Iterator[Grid]:
     """The medians."""
     rows = []
     for name, task in results["tasks"].items():
         medians = ((task[n]["took"]["median"], task[n]["final"]["median"]) for n in TITLES)
         cells = (f"{short(took)} ({short(100 * left)})" for took, left in medians)
         rows.append(Row(name, (str(task["parameters"]), *cells)))
-    return Grid(
+    yield Grid(
         "Earlier batches seen again: evaluations to 90 % (and what is left at the end, in %)",
         f"Medians over {results['starts']} starts; - where not more than half get there.",
         ("task", "parameters", *TITLES.values()),

@@ -3,6 +3,7 @@
 All have the same evaluations to spend, so many samples a step mean few steps.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ def measure(starts: int, folder: Path, fresh: bool) -> dict[str, Any]:
     return {"tasks": tasks}
 
 
-def table(results: dict[str, Any]) -> Grid:
+def tables(results: dict[str, Any]) -> Iterator[Grid]:
     """The medians."""
     tasks = results["tasks"]
     numbers = sorted({number for task in tasks.values() for number in task["samples"]})
@@ -36,7 +37,7 @@ def table(results: dict[str, Any]) -> Grid:
         left = dict(zip(task["samples"], task["errors"], strict=True))
         cells = (short(100 * left[number][1]) if number in left else "" for number in numbers)
         rows.append(Row(name, (str(task["evaluations"]), *cells)))
-    return Grid(
+    yield Grid(
         "Error that is left, in %, by the number of samples in a step",
         f"Medians over {results['starts']} starts, after equally many evaluations.",
         ("task", "evaluations", *(f"N = {number}" for number in numbers)),

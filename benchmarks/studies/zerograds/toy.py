@@ -1,5 +1,6 @@
 """Fig. 4: a surrogate learns a function of one parameter near the parameter, which follows it."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,8 @@ import smoothdiff as sd
 from benchmarks._grid import Grid, Row
 from benchmarks._style import COLOURS
 from benchmarks._task import Budget, Problem
-from benchmarks.studies.zerograds._runs import PLENTY, Steps, ours, panels
+from benchmarks.methods import zerograds
+from benchmarks.studies.zerograds._runs import PLENTY, Steps, panels
 from smoothdiff.surrogates import MLP
 
 SHOWN = (0.0, 0.1, 0.35, 1.0)  # of the iterations, as in the paper
@@ -51,7 +53,7 @@ def measure(starts: int, folder: Path, fresh: bool) -> dict[str, Any]:
         sigma=SIGMA,
         budget=Budget(BUDGET, PLENTY),
     )
-    solver = ours(problem, surrogate=MLP(1, key=jax.random.key(1)))
+    solver = zerograds.solver(problem, surrogate=MLP(1, key=jax.random.key(1)))
     steps = Steps(solver, problem)
     along = steps.at(SHOWN, jnp.asarray(START, jnp.float32), jax.random.key(0))
     frames = []
@@ -76,13 +78,13 @@ def measure(starts: int, folder: Path, fresh: bool) -> dict[str, Any]:
     return {"reference": REFERENCE, "frames": frames}
 
 
-def table(results: dict[str, Any]) -> Grid:
+def tables(results: dict[str, Any]) -> Iterator[Grid]:
     """Where the parameter is."""
     rows = []
     for frame in results["frames"]:
         values = (f"{frame[name]:.3f}" for name in ("y", "loss", "smoothed"))
         rows.append(Row(f"{frame['share']:.0%}", (str(frame["evaluations"]), *values)))
-    return Grid(
+    yield Grid(
         "Toy: a staircase with a wide plateau and a dip",
         f"The parameter that is sought is {results['reference']}.",
         ("share of the iterations", "evaluations", "parameter", "loss", "smoothed loss"),
