@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks._levels import Race
+from benchmarks._levels import Race, Settings
 from benchmarks._task import Method
 
 SEEDS = range(10_000, 10_005)  # in no ensemble
@@ -33,19 +33,25 @@ class Tuned(NamedTuple):
 
 
 def tune(
-    race: Race, method: Method, grid: Grid, seeds: Sequence[int] = SEEDS, turns: int = TURNS
+    race: Race,
+    method: Method,
+    grid: Grid,
+    seeds: Sequence[int] = SEEDS,
+    turns: int = TURNS,
+    fixed: Settings | None = None,
 ) -> Tuned:
-    """By the geometric mean of the evaluations to the last level.
+    """By the geometric mean of the evaluations to the last level; `fixed` stays as it is.
 
     Raises:
         NotAble: The method cannot run on the task.
     """
 
     def cost(settings: dict[str, float]) -> float:
-        took = race(method, seeds, settings)[:, -1]
+        took = race(method, seeds, {**(fixed or {}), **settings})[:, -1]
         return float(np.exp(np.mean(np.log(np.minimum(took, PENALTY * race.budget)))))
 
-    return search(cost, grid, turns)
+    found = search(cost, grid, turns)
+    return found._replace(settings={**(fixed or {}), **found.settings})
 
 
 def search(cost: Callable[[dict[str, float]], float], grid: Grid, turns: int = TURNS) -> Tuned:

@@ -67,8 +67,8 @@ def _measure(task: Task, race: Race, options: Namespace) -> dict[str, Any]:
             said, method = settings(task.name, name, unit), _registry.method(name)
             line["published"] = _took(race(method, starts, said))
             if name in TUNED:
-                best = tune(race, method, _around(said), seeds, turns)
-                line["best"] = _took(race(method, starts, said | best.settings))
+                best = tune(race, method, _around(said), seeds, turns, said)
+                line["best"] = _took(race(method, starts, best.settings))
                 line["settings"], line["at the edge"] = best.settings, best.at_the_edge
         methods[name] = line
     cma_es = _registry.method("cma_es")
