@@ -1,19 +1,23 @@
 """Tasks that are black boxes, as a study: what is measured on them, drawn and shown."""
 
 from argparse import Namespace
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
 from benchmarks import _atlas, _loop, _registry
+from benchmarks._grid import short
+from benchmarks._levels import Race
 from benchmarks._pictures import draw
 from benchmarks._study import setting
 from benchmarks._summary import summarise
 from benchmarks._tables import compare, tables
-from benchmarks._task import Method, NotAble, Problem, Solve, precision_of
+from benchmarks._task import Method, NotAble, Problem, Solve, Task, precision_of
+from benchmarks._tune import tune
 
 __all__ = ["compare", "draw", "forgiving", "measure", "tables", "usual"]
 
@@ -38,13 +42,36 @@ def measure(name: str, options: Namespace, folder: Path, bar: tqdm | None = None
     how = {"setting": setting(options), "fresh": options.fresh, "progress": bar}
     for task in _registry.family(name, options.full):
         seeds = range(options.seeds or task.seeds)
-        runs = _loop.run(task, methods, seeds, folder / "raw" / task.name, **how)
+        best = _best(task, methods, folder / "tuned" / task.name) if options.tuned else []
+        runs = _loop.run(task, [*methods, *best], seeds, folder / "raw" / task.name, **how)
         with precision_of(task):
             pictures = _atlas.rendered(task, _loop.able(runs))
             tasks[task.name] = summarise(task, runs) | {"pictures": pictures}
     if bar is not None:
         bar.clear()  # what is printed next would be on its line
     return {"title": _registry.task(name).title, "tasks": tasks}
+
+
+def _best(task: Task, methods: Sequence[Method], folder: Path) -> list[Method]:
+    """Those that have a grid again, each at the best of it, whatever else it is called."""
+    race, found = Race(task, folder), []
+    for method in methods:
+        if not (grid := _registry.grid(method.name)):
+            continue
+        try:
+            best = tune(race, method, grid).settings
+        except NotAble:
+            continue  # as it is without settings, which is said there
+        said = ", ".join(f"{setting} {short(value)}" for setting, value in best.items())
+        found.append(
+            Method(
+                f"{method.name}-best",
+                f"{method.title}, best of a grid: {said}",
+                partial(method.prepare, **best),
+                method.source + said,
+            )
+        )
+    return found
 
 
 def _forgiven(method: Method) -> Method:

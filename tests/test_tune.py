@@ -104,6 +104,14 @@ def test_tuning_takes_other_starts_than_those_scored(tmp_path):
     assert {path.stem.rpartition("-")[2] for path in tmp_path.glob("*.npz")} == {"10000"}
 
 
+def test_what_is_fixed_stays(tmp_path):
+    fast = lambda problem, *, rate, times: walk(problem, rate=rate * times)
+    method = Method("fast", "Fast", fast, "")
+    race = Race(line(), tmp_path)
+    found = tune(race, method, {"rate": (0.5, 1.0, 2.0)}, SEEDS[:1], 1, {"rate": 9.0, "times": 10})
+    assert found.settings == {"rate": 1.0, "times": 10}
+
+
 def test_a_method_that_is_not_able_says_so(tmp_path):
     with pytest.raises(NotAble, match="residuals"):
         tune(Race(line(), tmp_path), _registry.method("least_squares"), {"step": (1.0, 2.0)})

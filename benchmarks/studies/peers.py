@@ -90,22 +90,26 @@ def _took(evaluations: np.ndarray) -> dict[str, Any]:
     return {"solved": int(np.isfinite(last).sum())} | quartiles(list(last))
 
 
-def best_peer(task: dict[str, Any], kind: str) -> str | None:
+def took_of(line: dict[str, Any], kind: str) -> dict[str, Any] | None:
+    """What a peer took; its best is that of its one setting where that is lower after all."""
+    kinds = ["one setting"] if kind == "one setting" else ["best", "one setting"]
+    there = [line[each] for each in kinds if each in line and line[each]["median"] is not None]
+    return min(there, key=lambda took: took["median"], default=None)
+
+
+def best_peer(task: dict[str, Any], kind: str) -> tuple[str, dict[str, Any]] | None:
     """The peer with the lowest median, if any solves more than half of the starts."""
-    medians = {
-        name: line[kind]["median"]
-        for name, line in task["peers"].items()
-        if kind in line and line[kind]["median"] is not None
-    }
-    return min(medians, key=lambda name: medians[name]) if medians else None
+    each = ((name, took_of(line, kind)) for name, line in task["peers"].items())
+    there = [(name, took) for name, took in each if took is not None]
+    return min(there, key=lambda found: found[1]["median"], default=None)
 
 
 def ratio(task: dict[str, Any], kind: str) -> float | None:
     """Evaluations of the best peer over ours: above 1 we are ahead; None if only one is there."""
-    name = best_peer(task, kind)
-    if name is None or task["ours"]["median"] is None:
+    found = best_peer(task, kind)
+    if found is None or task["ours"]["median"] is None:
         return None
-    return task["peers"][name][kind]["median"] / task["ours"]["median"]
+    return found[1]["median"] / task["ours"]["median"]
 
 
 def tables(results: dict[str, Any]) -> Iterator[Grid]:
@@ -135,8 +139,8 @@ def tables(results: dict[str, Any]) -> Iterator[Grid]:
 
 
 def _against(task: dict[str, Any], starts: int) -> Row:
-    name = best_peer(task, "best")
-    peer = ("-", "-") if name is None else (name, _cell(task["peers"][name]["best"], starts))
+    found = best_peer(task, "best")
+    peer = ("-", "-") if found is None else (found[0], _cell(found[1], starts))
     return Row(task["title"], (_cell(task["ours"], starts), *peer, short(ratio(task, "best"))))
 
 
