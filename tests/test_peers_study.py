@@ -54,7 +54,7 @@ def test_ratios_are_to_wang_hvpa_of_the_same_kind(tmp_path):
         "fischer_fr22": row | {"published": levels(60, 90), "best": levels(10, 20)},
         "wang_hvpa": {"paper": [1, 1], "logs": [50, 60], "published": levels(30, None)},
         "cma_es": {"paper": [1.0, 2.0], "best": levels(5, 6), "at the edge": ["first"]},
-        "shortest_call": {"best": levels(4, 5)},
+        "shortest_call": {"published": levels(4, 5)},
     }
     faster = [{"times": k, "took": levels(60 / k, 90)} for k in papers.FASTER]
     found = {"title": "A task", "methods": methods, "faster": faster}
