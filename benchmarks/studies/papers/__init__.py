@@ -2,8 +2,8 @@
 
 For each task: what the paper says; the same method here at the settings of its Table 3; CMA-ES; and
 the shortest call of this library. With --tuned also Fischer-FR22, Wang-HVPA and CMA-ES at the best
-of a grid, which is sought on starts that are not scored. Fischer-FR22 at ever larger rates, and all else as in the table, shows how much of its
-time is the way to go over the rate.
+of a grid, which is sought on starts that are not scored. Fischer-FR22 at ever larger rates, and all
+else as in the table, shows how much of its time is the way to go over the rate.
 """
 
 from argparse import Namespace
