@@ -80,8 +80,13 @@ class Race:
         recorder = Recorder(self._counter, self._problem, y0)
         unravel: Callable[[Any], Any] = ravel_pytree(self.task.problem.like)[1]
         first, took, points = gap(y0), np.full(len(LEVELS), np.inf), 0
+        looked = recorder.last[2]
 
         def look(y: Any) -> None:
+            nonlocal looked
+            if np.array_equal(recorder.last[2], looked):
+                return  # it stayed where it was
+            looked = recorder.last[2]
             there = gap(y) <= np.array(LEVELS) * first
             took[there & np.isinf(took)] = recorder.last[0]
 
