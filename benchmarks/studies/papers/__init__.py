@@ -151,12 +151,16 @@ def _rows(task: dict[str, Any], starts: int) -> Iterator[Row]:
         edge = "*" if line.get("at the edge") else ""
         cells = (
             " / ".join(map(short, line["paper"])) if "paper" in line else "",
-            " / ".join(map(short, said)),
+            " / ".join(map(short, said)) if "logs" in line else "",
             " / ".join(short(ratio(task, name, level)) for level in LEVELS),
-            " / ".join(_cell(line.get("published", {}).get(level), starts) for level in LEVELS),
-            " / ".join(_cell(line.get("best", {}).get(level), starts) for level in LEVELS) + edge,
+            _both(line.get("published"), starts),
+            _both(line.get("best"), starts) + edge,
         )
         yield Row("  " + titles[name], cells, end=name == "shortest_call")
+
+
+def _both(took: dict[str, Any] | None, starts: int) -> str:
+    return "" if took is None else " / ".join(_cell(took[level], starts) for level in LEVELS)
 
 
 def _cell(took: dict[str, Any] | None, starts: int) -> str:
