@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import _registry
+from benchmarks import _black_boxes, _registry
 from benchmarks._levels import LEVELS, Race
 from benchmarks._task import Budget, Method, NotAble, Problem, Score, Task
 from benchmarks._tune import SEEDS, search, tune
@@ -110,6 +110,17 @@ def test_what_is_fixed_stays(tmp_path):
     race = Race(line(), tmp_path)
     found = tune(race, method, {"rate": (0.5, 1.0, 2.0)}, SEEDS[:1], 1, {"rate": 9.0, "times": 10})
     assert found.settings == {"rate": 1.0, "times": 10}
+
+
+def test_a_task_can_be_run_with_the_best_beside_the_one_setting(tmp_path, monkeypatch):
+    grids = {"walk": {"rate": (0.5, 1.0, 2.0)}}
+    monkeypatch.setattr(_registry, "grid", lambda name: grids.get(name, {}))
+    other = Method("other", "Other", walk, "")
+    (best,) = _black_boxes._best(line(), [WALK, other], tmp_path)
+    assert best.name == "walk-best"
+    assert best.title.startswith("Walk, best of a grid: rate ")
+    slow, fast = (Race(line(), tmp_path / "runs")(each, [0])[0, -1] for each in (WALK, best))
+    assert fast < slow
 
 
 def test_a_method_that_is_not_able_says_so(tmp_path):
