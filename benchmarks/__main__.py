@@ -20,6 +20,7 @@ FLAGS: dict[str, dict] = {
     "seeds": {"type": int, "metavar": "N", "help": "number of starts"},
     "fresh": {"action": "store_true", "help": "run again what has been run"},
     "methods": {"metavar": "A,B", "help": "these, separated by commas"},
+    "tuned": {"action": "store_true", "help": "also at the best of a grid, on other starts"},
     "compare": {"action": "store_true", "help": "show the committed results too"},
     "runs": {"action": "store_true", "help": "of what was run here, not of what is committed"},
 }
@@ -33,7 +34,7 @@ def parser() -> argparse.ArgumentParser:
     run = commands.add_parser("run", help="run methods on tasks; what has been run is kept")
     names = [*_registry.tasks(), "all"]
     run.add_argument("names", nargs="+", metavar="TASK", choices=names, help="or all: the scenes")
-    _add(run, "full", "seeds", "methods", "fresh", "compare")
+    _add(run, "full", "seeds", "methods", "tuned", "fresh", "compare")
     again = commands.add_parser("draw", help="pictures and tables of committed results")
     again.add_argument("names", nargs="+", metavar="NAME", help="of a task or of a command")
     for name, study in _registry.studies().items():

@@ -1,14 +1,17 @@
 """Tasks that are black boxes, as a study: what is measured on them, drawn and shown."""
 
 from argparse import Namespace
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
 from benchmarks import _atlas, _loop, _registry
+from benchmarks._grid import short
+from benchmarks._levels import Race
 from benchmarks._pictures import draw
 from benchmarks._study import setting
 from benchmarks._summary import summarise
@@ -48,6 +51,28 @@ def measure(name: str, options: Namespace, folder: Path, bar: tqdm | None = None
     if bar is not None:
         bar.clear()  # what is printed next would be on its line
     return {"title": _registry.task(name).title, "tasks": tasks}
+
+
+def _best(task: Task, methods: Sequence[Method], folder: Path) -> list[Method]:
+    """Those that have a grid again, each at the best of it, whatever else it is called."""
+    race, found = Race(task, folder), []
+    for method in methods:
+        if not (grid := _registry.grid(method.name)):
+            continue
+        try:
+            best = tune(race, method, grid).settings
+        except NotAble:
+            continue  # as it is without settings, which is said there
+        said = ", ".join(f"{setting} {short(value)}" for setting, value in best.items())
+        found.append(
+            Method(
+                f"{method.name}-best",
+                f"{method.title}, best of a grid: {said}",
+                partial(method.prepare, **best),
+                method.source + said,
+            )
+        )
+    return found
 
 
 def _forgiven(method: Method) -> Method:

@@ -105,7 +105,7 @@ class Recorder:
         self._counter, self._budget, self._iterations = counter, problem.budget, iterations
         self._gap = gap
         self.trace = [(0, 0.0, flat(y0))]
-        self._last = self.trace[0]
+        self.last = self.trace[0]
         counter.evaluations = 0
         self._began = time.perf_counter()
 
@@ -114,9 +114,9 @@ class Recorder:
         found = flat(y)  # waits for the evaluations behind y
         seconds = time.perf_counter() - self._began
         evaluations = self._counter.evaluations if iterations is None else iterations
-        self._last = (evaluations, seconds, found)
+        self.last = (evaluations, seconds, found)
         if iterations is not None or evaluations >= GROWTH * self.trace[-1][0]:
-            self.trace.append(self._last)
+            self.trace.append(self.last)
         self._iterations -= 1
         spent = evaluations >= self._budget.evaluations or seconds >= self._budget.seconds
         if spent or self._iterations <= 0:
@@ -129,8 +129,8 @@ class Recorder:
 
     def finish(self) -> list[Point]:
         """The points kept, with the last one."""
-        if self.trace[-1] is not self._last:
-            self.trace.append(self._last)
+        if self.trace[-1] is not self.last:
+            self.trace.append(self.last)
         return self.trace
 
 
@@ -237,11 +237,11 @@ def run(
     """
     runner, found = Runner(task, keep), dict[Method, Any]((method, []) for method in methods)
     with precision_of(task), _bar(progress, len(methods) * len(seeds)) as bar:
-        behaviour = _behaviour(task)
+        as_it_is = behaviour(task)
         for seed, method in itertools.product(seeds, methods):
             bar.set_description(f"{task.name}: start {seed}, {method.name}")
             path = folder / f"{method.name}-{seed}-{setting}.npz"
-            stale = fingerprint(behaviour, method.source, sorted(keep))
+            stale = fingerprint(as_it_is, method.source, sorted(keep))
             if isinstance(found[method], list):
                 try:
                     made = kept(path, stale, partial(runner, method, seed), fresh)
@@ -273,7 +273,7 @@ def _bar(progress: tqdm | bool | None, runs: int) -> AbstractContextManager[tqdm
     return tqdm(total=runs, disable=progress is False, unit="run")
 
 
-def _behaviour(task: Task) -> str:
+def behaviour(task: Task) -> str:
     """Changes when the task does: its settings, and what its black box says at two points."""
     if task.choose is not None:
         task.choose(0)

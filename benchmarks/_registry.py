@@ -82,6 +82,12 @@ def method(name: str) -> Method:
     return Method(name, entry.title, entry.prepare, _source(inspect.getsource(module)))
 
 
+def grid(name: str) -> dict[str, tuple[float, ...]]:
+    """Values for the settings of a method, among which its best are sought; see `_tune`."""
+    _, entry = _named(_entries(), name, "method")
+    return {setting: tuple(values) for setting, values in entry.grid.items()}
+
+
 def studies() -> dict[str, ModuleType]:
     """The commands beside `run`, by name."""
     return {module.__name__.rpartition(".")[2]: module for module in _modules(studies_package)}

@@ -259,11 +259,15 @@ def entry(
 
 
 class MethodEntry(NamedTuple):
-    """A line of a module's METHODS: its title, and the kinds of tasks that it runs on unasked."""
+    """A line of a module's METHODS: its title, and the kinds of tasks that it runs on unasked.
+
+    `grid` has values from low to high for settings of `prepare`, by their names; see `_tune`.
+    """
 
     title: str
     kinds: tuple[Kind, ...]
-    prepare: Callable[[Problem], Solve]
+    prepare: Callable[..., Solve]
+    grid: Mapping[str, Sequence[float]] = {}
 
 
 def precision_of(task: Task) -> AbstractContextManager[None]:

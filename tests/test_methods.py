@@ -14,9 +14,7 @@ from jax.flatten_util import ravel_pytree
 from benchmarks import _registry, _study
 from benchmarks._loop import Counter, Recorder, Stop
 from benchmarks._task import Budget, Grey, Kind, NotAble, Problem
-from benchmarks.methods import grey_box, higher_order
-from benchmarks.methods._flat import Flat
-from benchmarks.methods.higher_order import _move, _turn
+from benchmarks.methods import grey_box
 
 START, REFERENCE = np.array([-0.8, 0.9]), np.array([0.7, -0.4])
 LOW, HIGH = -1.0, 1.0
@@ -44,10 +42,18 @@ SLOW = {
     # the slope that sets the unit, then the value and the gradient of the first step
     "optimistix_bfgs": (200, 1e-6, 4 + 1 + 4),
     "jaxopt_lbfgs": (1600, 1e-2, None),
-    "our_gradient": (2000, 1e-2, 4 * 2),
+    "shortest_call": (60, 1e-6, 1),
+    "dfo_ls": (60, 1e-6, 1),
+    "dfo_ls_noise": (60, 1e-6, 1),
+    "least_squares": (60, 1e-6, 1),
+    "fischer_fr22": (2000, 1e-2, 4),
+    "wang_g": (2000, 1e-2, 4 * 2),
     # the first gradient, some steps of a gradient and a product each, the gradient at their end
-    "our_hvpa": (2000, 0.3, 12 + 3 * (12 + 2 * 12) + 12),
+    "wang_h": (2000, 0.3, 8 + 3 * (8 + 3 * 4) + 8),
+    "wang_hvp": (2000, 0.3, 8 + 3 * (8 + 2 * 8) + 8),
+    "wang_hvpa": (2000, 0.3, 4 + 3 * (4 + 2 * 4) + 4),
 }
+GPL = {"py_bobyqa": "pybobyqa", "dfo_ls": "dfols", "dfo_ls_noise": "dfols"}
 # evaluations, what must be left, and the evaluations of an iteration
 MANY = {
     "local_cross_entropy": (320, 1e-3, 32),
@@ -183,8 +189,8 @@ def test_committed_results_name_methods_by_their_titles():
 )
 def test_progress_bounds_and_counts(name):
     # GPL, so it is no part of the extra for tests; a method of any other package has to run
-    if name == "py_bobyqa":
-        pytest.importorskip("pybobyqa", reason='needs pip install -e ".[peers]"')
+    if name in GPL:
+        pytest.importorskip(GPL[name], reason='needs pip install -e ".[peers]"')
     budget, left, first = (QUICK | SLOW)[name]
     problem, seen = bowl(budget)
     evaluations, found, counter = ran(name, problem, tree(*START))
@@ -256,42 +262,11 @@ def test_double_precision(name, x64):
 
 
 def test_a_method_is_stale_only_when_what_it_imports_has_changed():
-    source = {name: _registry.method(name).source for name in ("our_hvpa", "zerograds")}
-    assert "Table 3 of Stochastic" in source["our_hvpa"]
-    assert "class Flat" in source["our_hvpa"]
+    source = {name: _registry.method(name).source for name in ("wang_hvpa", "zerograds")}
+    assert "Wang-HVPA conjugate gradients" in source["wang_hvpa"]
+    assert "class Flat" in source["wang_hvpa"]
     assert "def run_by" in source["zerograds"]
     assert "class Flat" not in source["zerograds"]
-
-
-@pytest.mark.slow
-def test_sampled_products_have_the_units_of_the_hessian(monkeypatch, key):
-    monkeypatch.setattr(higher_order, "AGGREGATE", 8192)
-    flat = Flat(bowl()[0])
-    v = jnp.array([0.3, -2.0])
-    x = jnp.array([0.1, 0.0])  # far from the bounds, in units of sigma
-    found = higher_order.Aggregate(flat).product(key, 0.1, x, v)
-    assert found == pytest.approx(MATRIX @ np.asarray(v), rel=0.1)
-
-
-def test_conjugate_steps_find_the_minimum_of_a_quadratic_in_as_many_steps_as_dimensions():
-    x = jnp.array(START)
-    gradient = lambda x: jnp.asarray(MATRIX, jnp.float32) @ (x - jnp.asarray(REFERENCE, x.dtype))
-    r = v = -gradient(x)
-    for _ in range(2):
-        x, _ = _move(x, v, gradient(x), jnp.asarray(MATRIX, x.dtype) @ v, 100.0, -10.0, 10.0)
-        new = -gradient(x)
-        r, v = new, _turn(r, v, new, False)
-    assert x == pytest.approx(REFERENCE, abs=1e-5)
-
-
-def test_without_curvature_the_step_goes_downhill_to_the_edge_of_the_trust_region():
-    x, v = jnp.zeros(2), jnp.array([3.0, 4.0])
-    for g, way in ((-v, 1), (v, -1)):
-        to, moved = _move(x, v, g, -v, 0.5, -1.0, 1.0)
-        assert to == pytest.approx(way * 0.1 * np.asarray(v))
-        assert moved == pytest.approx(0.5)
-    to, moved = _move(x, v, -v, jnp.zeros(2), 10.0, -1.0, 1.0)
-    assert to == pytest.approx([1.0, 1.0])  # the bounds
 
 
 def test_renders_are_counted_in_grey_boxes():

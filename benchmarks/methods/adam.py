@@ -29,18 +29,22 @@ PAIR = 2  # samples of FR22
 NUM_SAMPLES = 3  # of optax.perturbations, which subtracts the value at the point itself
 
 
-def optimiser(problem: Problem, evaluations_per_step: int) -> optax.GradientTransformation:
+def optimiser(
+    problem: Problem, evaluations_per_step: int, rate: float = LEARNING_RATE
+) -> optax.GradientTransformation:
     """Adam for a problem, for a method that spends so many evaluations on a step."""
-    steps = problem.budget.evaluations // evaluations_per_step
-    rate = LEARNING_RATE * problem.sigma
-    return optax.adam(optax.linear_schedule(rate, DECAY * rate, steps))
+    steps, first = problem.budget.evaluations // evaluations_per_step, rate * problem.sigma
+    return optax.adam(optax.linear_schedule(first, DECAY * first, steps))
 
 
 def adam(
-    flat: Flat, gradient: Callable[[Key, int, jax.Array], jax.Array], evaluations_per_step: int
+    flat: Flat,
+    gradient: Callable[[Key, int, jax.Array], jax.Array],
+    evaluations_per_step: int,
+    rate: float = LEARNING_RATE,
 ) -> Solve:
     """Adam on `gradient(key, i, x)` of step i, within the bounds; it is called as it is."""
-    optim = optimiser(flat.problem, evaluations_per_step)
+    optim = optimiser(flat.problem, evaluations_per_step, rate)
 
     @jax.jit
     def move(x, state, slope):
@@ -50,9 +54,11 @@ def adam(
     return flat.iterate(lambda key, i, x, state: move(x, state, gradient(key, i, x)), optim.init)
 
 
-def finite_differences(problem: Problem) -> Solve:
+def finite_differences(
+    problem: Problem, *, rate: float = LEARNING_RATE, step: float = STEP
+) -> Solve:
     """Central ones; they need nothing but the loss, also beyond the bounds."""
-    flat, step = Flat(problem), STEP * problem.sigma
+    flat, step = Flat(problem), step * problem.sigma
     evaluations = 2 * flat.size
     if evaluations > problem.budget.evaluations:
         raise NotAble(f"needs {evaluations:,} evaluations for its first step")
@@ -66,64 +72,82 @@ def finite_differences(problem: Problem) -> Solve:
 
         return jax.lax.map(slope, jnp.arange(flat.size), batch_size=BATCH)
 
-    return adam(flat, lambda key, i, x: gradient(x), evaluations)
+    return adam(flat, lambda key, i, x: gradient(x), evaluations, rate)
 
 
-def native(problem: Problem) -> Solve:
+def native(problem: Problem, *, rate: float = LEARNING_RATE) -> Solve:
     """The renderer's own automatic differentiation: what one uses where it works."""
     if problem.native_ad is None:
         raise NotAble("this task has no derivative of its own")
     flat, value_and_grad = Flat(problem), problem.native_ad()
     gradient = lambda key, i, x: ravel_pytree(value_and_grad(flat.tree(x))[1])[0]
-    return adam(flat, gradient, evaluations_per_step=2)
+    return adam(flat, gradient, evaluations_per_step=2, rate=rate)
 
 
-def sigma_at(problem: Problem, evaluations_per_step: int) -> optax.Schedule:
+def sigma_at(problem: Problem, evaluations_per_step: int, end: float = SIGMA_END) -> optax.Schedule:
     """Annealed linearly over the budget, as in the paper of FR22."""
     steps = problem.budget.evaluations // evaluations_per_step
-    return optax.linear_schedule(problem.sigma, SIGMA_END * problem.sigma, steps)
+    return optax.linear_schedule(problem.sigma, end * problem.sigma, steps)
 
 
-def fr22_solver(problem: Problem, directions: type[sd.Gaussian] = sd.Gaussian) -> sd.FirstOrder:
+def fr22_solver(
+    problem: Problem,
+    directions: type[sd.Gaussian] = sd.Gaussian,
+    *,
+    rate: float = LEARNING_RATE,
+    sigma_end: float = SIGMA_END,
+) -> sd.FirstOrder:
     """After Fischer and Ritschel 2022: samples in antithetic pairs, nothing is subtracted."""
     return sd.FirstOrder(
-        optimiser(problem, PAIR),
-        sigma_at(problem, PAIR),
+        optimiser(problem, PAIR, rate),
+        sigma_at(problem, PAIR, sigma_end),
         num_samples=PAIR,
         sampler=directions(antithetic=True),
         baseline="none",
     )
 
 
-def fr22(problem: Problem) -> Solve:
+def fr22(problem: Problem, **settings: Any) -> Solve:
     """One solver and one function for all starts, so that they are compiled once."""
-    return run_by(sd.minimise, problem, problem.loss, fr22_solver(problem))
+    return run_by(sd.minimise, problem, problem.loss, fr22_solver(problem, **settings))
 
 
-def optax_perturbations(problem: Problem) -> Solve:
+def optax_perturbations(
+    problem: Problem, *, rate: float = LEARNING_RATE, num_samples: int = NUM_SAMPLES
+) -> Solve:
     """What a user of optax has at hand, with Gaussian noise; sigma falls as for FR22."""
-    flat, evaluations = Flat(problem), NUM_SAMPLES + 1
+    flat, evaluations = Flat(problem), num_samples + 1
     sigma = sigma_at(problem, evaluations)
     smooth: Any = perturbations.make_perturbed_fun  # it takes more than its annotations say
 
     @jax.jit
     def gradient(key, i, x):
         width = jnp.asarray(sigma(i), flat.dtype)
-        smoothed = smooth(flat.loss, NUM_SAMPLES, width, perturbations.Normal())
+        smoothed = smooth(flat.loss, num_samples, width, perturbations.Normal())
         return jax.grad(smoothed, argnums=1)(key, x)
 
-    return adam(flat, gradient, evaluations)
+    return adam(flat, gradient, evaluations, rate)
 
 
+RATES = (0.15, 0.3, 0.6)  # grids begin from the one setting for all, and go on as far as they pay
 METHODS = {
     "finite_differences": MethodEntry(
-        "Finite differences, Adam", ("scene", "program", "function"), finite_differences
+        "Finite differences, Adam",
+        ("scene", "program", "function"),
+        finite_differences,
+        {"rate": RATES, "step": (0.1, 0.3, 0.9)},
     ),
-    "mitsuba_ad": MethodEntry("Mitsuba AD, Adam", ("scene",), native),
+    "mitsuba_ad": MethodEntry("Mitsuba AD, Adam", ("scene",), native, {"rate": RATES}),
     "fr22": MethodEntry(
-        "Smoothed gradient, Adam (FR22)", ("scene", "large", "program", "function"), fr22
+        "Smoothed gradient, Adam (FR22)",
+        ("scene", "large", "program", "function"),
+        fr22,
+        {"rate": RATES, "sigma_end": (0.03, 0.1, 0.3)},
     ),
     "optax_perturbations": MethodEntry(
-        "optax.perturbations, Adam", ("scene",), optax_perturbations
+        "optax.perturbations, Adam",
+        ("scene",),
+        optax_perturbations,
+        {"rate": RATES, "num_samples": (1, 3, 6)},
     ),
 }

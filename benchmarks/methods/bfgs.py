@@ -28,11 +28,11 @@ STEPS = 10  # in a round
 SLOPE_END = 1e-3  # of the gradient, as a share of the first one of the round
 
 
-def on_differences(problem: Problem) -> Solve:
+def on_differences(problem: Problem, *, widest: float = WIDTHS[0]) -> Solve:
     """BFGS as in optimistix, on central differences: 2 n evaluations for a gradient.
 
-    The width of the differences shrinks (implicit filtering). The first step of each width is one
-    sigma long.
+    The width of the differences shrinks (implicit filtering), from the widest, in units of sigma.
+    The first step of each width is one sigma long.
     """
     flat, sigma = Flat(problem), problem.sigma
     scaled = lambda u: flat.loss(sigma * u)
@@ -71,7 +71,8 @@ def on_differences(problem: Problem) -> Solve:
         u, state, _ = solver(width).step(fun, u, args, {}, state, TAGS)
         return u, state, solver(width).terminate(fun, u, args, {}, state, TAGS)[0]
 
-    return rounds(flat, lambda: WIDTHS, slope, init, step, MOST)
+    widths = [widest / WIDTHS[0] * width for width in WIDTHS]
+    return rounds(flat, lambda: widths, slope, init, step, MOST)
 
 
 def on_a_smoothed_loss(problem: Problem) -> Solve:
@@ -131,7 +132,10 @@ def rounds(
 
 METHODS = {
     "optimistix_bfgs": MethodEntry(
-        "BFGS on finite differences (optimistix)", ("scene",), on_differences
+        "BFGS on finite differences (optimistix)",
+        ("scene",),
+        on_differences,
+        {"widest": (1.0, 2.0, 4.0)},
     ),
     "jaxopt_lbfgs": MethodEntry(
         "L-BFGS on a smoothed loss, fixed key (jaxopt)", ("scene",), on_a_smoothed_loss

@@ -32,11 +32,11 @@ MOST_GENES = 100_000  # PyGAD goes through them one by one
 SILENT = logging.Logger("silent", logging.CRITICAL + 1)  # it would log how record ends a run
 
 
-def cma_es(problem: Problem) -> Solve:
+def cma_es(problem: Problem, *, first: float = 1.0) -> Solve:
     """When it stops it starts again from a random point with twice the population (IPOP).
 
     As `cma.fmin2` does with `restarts`. A restart is shown once it has seen something better than
-    all before it.
+    all before it. `first` is the first step size, in units of sigma.
     """
     cma, flat = package("cma", "cma"), Flat(problem)
     if flat.size > MOST:
@@ -49,7 +49,7 @@ def cma_es(problem: Problem) -> Solve:
         start, lowest, shown = flat.start(y0), np.inf, y0
         for restart in itertools.count():
             options = width | {"popsize": _usual_population(flat) * 2**restart}
-            search = _search(cma, flat, start, int(random.integers(1, 2**31)), options)
+            search = _search(cma, flat, start, int(random.integers(1, 2**31)), options, first)
             while not search.stop():
                 _generation(search, flat)
                 if search.best.f < lowest:
@@ -84,9 +84,11 @@ def _usual_population(flat: Flat) -> int:
     return 4 + int(3 * np.log(flat.size))
 
 
-def _search(cma: Any, flat: Flat, start: np.ndarray, seed: int, options: dict) -> Any:
+def _search(
+    cma: Any, flat: Flat, start: np.ndarray, seed: int, options: dict, first: float = 1.0
+) -> Any:
     usual = {"bounds": list(flat.box), "seed": seed, "verbose": -9}
-    return cma.CMAEvolutionStrategy(start, flat.problem.sigma, usual | options)
+    return cma.CMAEvolutionStrategy(start, first * flat.problem.sigma, usual | options)
 
 
 def _generation(search: Any, flat: Flat) -> None:
@@ -152,7 +154,12 @@ def genetic_algorithm(problem: Problem) -> Solve:
 
 
 METHODS = {
-    "cma_es": MethodEntry("CMA-ES with restarts (pycma)", ("scene", "program", "function"), cma_es),
+    "cma_es": MethodEntry(
+        "CMA-ES with restarts (pycma)",
+        ("scene", "program", "function"),
+        cma_es,
+        {"first": (0.5, 1.0, 2.0)},
+    ),
     "cma_es_diagonal": MethodEntry(
         "CMA-ES, diagonal (pycma)", ("large", "program"), cma_es_diagonal
     ),

@@ -73,12 +73,12 @@ def _entry(estimator: str, estimate: Estimate, cost: Cost) -> MethodEntry:
 
 
 FR22 = _smoothed(num_samples=2, baseline="none", sampler=sd.Gaussian(antithetic=True))
-OUR_GRADIENT = _smoothed(sd.Importance(1), num_samples=2, baseline="none")
+WANG_G = _smoothed(sd.Importance(1), num_samples=2, baseline="none")
 AGGREGATE = _smoothed(num_samples=2, baseline="none", sampler=sd.Aggregate(1, share=0.0))
 METHODS = {
     "grey_differences": _entry("finite differences", _differences, lambda n: 2 * n),
     "grey_fr22": _entry("FR22", FR22, lambda n: 2),
-    "grey_our_gradient": _entry("OurG", OUR_GRADIENT, lambda n: 2 * n),
-    "grey_aggregate": _entry("OurG aggregate", AGGREGATE, lambda n: 2),
+    "grey_wang_g": _entry("Wang-G", WANG_G, lambda n: 2 * n),
+    "grey_aggregate": _entry("Wang-G aggregate", AGGREGATE, lambda n: 2),
     "grey_ours": _entry("smooth_grad (ours)", _smoothed(num_samples=4), lambda n: 4),
 }

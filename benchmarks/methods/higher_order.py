@@ -1,138 +1,201 @@
-"""The methods of the paper on higher-order rendering, at one setting for all tasks.
+"""The methods of the paper on higher-order rendering, by the rules that its authors ran them by.
 
-Table 3 of Stochastic Gradient Estimation for Higher-order Differentiable Rendering (HODR) has a
-setting for each task, chosen as the best. As here one serves all tasks, it is the median over the
-table's nine tasks, in units of the first sigma: two antithetic pairs, and a sigma that ends at 2 %
-and falls linearly (appendix L) with the evaluations used. The aggregate sampler draws six pairs, as
-the table has it for Box2 and Box10: with two it finds little. Nothing is subtracted.
-
-OurG is the importance-sampled gradient (eq. 17) with Adam, the same as for all first-order methods
-here. OurHVPA is conjugate gradients with sampled products with v.
+Stochastic Gradient Estimation for Higher-order Differentiable Rendering (Wang, Fischer, Ritschel
+2024). They are named after their authors: Fischer-FR22 and Wang-G are gradients with Adam at a
+constant rate, Wang-H, Wang-HVP and Wang-HVPA conjugate gradients with sampled Hessians, with
+products by elements, and with aggregate ones.
 
 $$ \\varepsilon = -\\frac{g \\cdot v}{v \\cdot H v}, \\quad x \\mathrel{+}= \\varepsilon v, \\quad
    r' = -g(x), \\quad \\beta = \\frac{r' \\cdot r'}{r \\cdot r}, \\quad v = r' + \\beta v $$
 
-(eq. 4-8: Fletcher-Reeves). The step is cut to a trust region of a few sigma and found anew a
-few times along the same line, with fresh samples; every few iterations, or where v does not lead
-down, v starts again from the residual. Where the curvature is not positive the step goes to the
-edge of the region, downhill, as a Newton step does with the Hessian modified to be positive.
+(eq. 4-8: Fletcher-Reeves). Where the curvature is not positive it is taken as one, so that the step
+is as small as the slope is. The step is cut to the trust region, and found anew along the same line
+with fresh samples until it is small or has been found often enough. After some iterations, or where
+v does not lead down, v starts again from the residual. The two ends of a product are drawn
+independently, a third of sigma away. Sigma falls linearly. There are no bounds but the problem's.
+
+All lengths are in units of the problem's sigma, which is the first one. Here one setting serves all
+tasks: the median over the nine tasks of the paper's Table 3. `benchmarks papers` has the table's
+own, on the paper's tasks; `run --tuned` the best of a grid.
 """
 
 import itertools
+from collections.abc import Callable
+from functools import partial
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
+import optax
 
 import smoothdiff as sd
 from benchmarks._task import MethodEntry, Problem, Solve
 from benchmarks.methods._flat import Flat
-from benchmarks.methods.adam import adam
+from benchmarks.methods._pairs import Slope, aggregate, by_element, fischer
 
-PER_ELEMENT = 4  # samples
-AGGREGATE = 12  # samples for all elements together
-SIGMA_END = 0.02  # of the problem's sigma
-SHIFT = 1 / 3  # epsilon |v| of eq. 8, in units of sigma, as in the authors' code
-RADIUS = 4.0  # of the trust region, in sigma; this and the next are the medians of table 3
-LINE_SEARCH = 3  # steps along a line
-TOLERANCE = 1e-3  # of a step along a line, in sigma
-RECOMPUTE = 10  # iterations after which v starts again
+SLOPES = {"fischer": fischer, "elements": by_element, "aggregate": aggregate}
+SHIFT = 1 / 3  # epsilon |v| of eq. 8, in units of sigma
+TOLERANCE = 1e-3  # of a squared step along a line
+# medians of Table 3
+PAIRS, SIGMA_END, RATE, TRUST, LINE_SEARCH, RECOMPUTE = 2, 0.02, 0.04, 4.0, 3, 10
 
 
-def sigma_at(flat: Flat, evaluations: int) -> jax.Array:
-    """The sigma after so many evaluations, of those that the problem allows."""
-    used = min(evaluations / flat.problem.budget.evaluations, 1)
-    return jnp.asarray(flat.problem.sigma * (1 - (1 - SIGMA_END) * used), flat.dtype)
+def falling(flat: Flat, end: float, iterations: float) -> Callable[[float], jax.Array]:
+    """Sigma after so many iterations; afterwards it stays."""
+    left = lambda i: 1 - (1 - end) * min(i / max(iterations, 1), 1)
+    return lambda i: jnp.asarray(flat.problem.sigma * left(i), flat.dtype)
 
 
-def our_gradient(problem: Problem) -> Solve:
-    """A set of samples for each parameter."""
-    flat = Flat(problem)
-    evaluations = PER_ELEMENT * flat.size
-    options = {"num_samples": PER_ELEMENT, "baseline": "none"}
-    slope = jax.jit(lambda key, sigma, x: sd.Importance(1)(flat.loss, sigma, **options)(key, x))
-    gradient = lambda key, i, x: slope(key, sigma_at(flat, i * evaluations), x)
-    return adam(flat, gradient, evaluations)
+def first_order(
+    problem: Problem,
+    slope: Literal["fischer", "elements"],
+    *,
+    pairs: int = PAIRS,
+    rate: float = RATE,
+    sigma_end: float = SIGMA_END,
+    fall: int | None = None,
+) -> Solve:
+    """Adam at a constant rate.
 
-
-class Aggregate:
-    """Derivatives of the smoothed loss of a flat vector by the aggregate sampler, compiled.
-
-    Attributes:
-        gradient: `(key, sigma, x) -> vector`, eq. 17.
-        product: `(key, sigma, x, v) -> vector`, eq. 8 and 23: the difference of two gradients, that
-            see the same random numbers; drawn independently, their difference is noise.
+    Args:
+        problem: The problem.
+        slope: How the gradient is sampled.
+        pairs: Of samples, for each element that is sampled.
+        rate: The learning rate, in units of sigma.
+        sigma_end: Of the first sigma.
+        fall: Iterations after which sigma is there; by default those of the budget.
     """
-
-    def __init__(self, flat: Flat):
-        sampler = sd.Aggregate(1, share=0.0)
-        options = {"num_samples": AGGREGATE, "sampler": sampler, "baseline": "none"}
-        smooth_grad = lambda sigma: sd.smooth_grad(flat.loss, sigma, **options)
-
-        @jax.jit
-        def product(key, sigma, x, v):
-            length = jnp.maximum(jnp.linalg.norm(v), jnp.finfo(v.dtype).tiny)
-            shifted = sd.difference_hvp(smooth_grad(sigma), SHIFT)
-            return shifted(key, x, v * (sigma / length)) * (length / sigma)
-
-        self.gradient = jax.jit(lambda key, sigma, x: smooth_grad(sigma)(key, x))
-        self.product = product
-
-
-@jax.jit
-def _move(x, v, g, hv, radius, low, high):
-    """One step along v, and its length."""
-    slope, curvature = jnp.vdot(g, v), jnp.vdot(v, hv)
-    length = jnp.linalg.norm(v)
-    far: jax.Array = radius / jnp.maximum(length, jnp.finfo(v.dtype).tiny)
-    step = -slope / jnp.where(curvature > 0, curvature, 1)
-    step = jnp.where(curvature > 0, jnp.clip(step, -far, far), -jnp.sign(slope) * far)
-    return jnp.clip(x + step * v, low, high), jnp.abs(step) * length
-
-
-@jax.jit
-def _turn(r, v, new, restart):
-    """The next direction: conjugate, or the residual itself."""
-    before = jnp.vdot(r, r)
-    beta = jnp.where(before > 0, jnp.vdot(new, new) / jnp.where(before > 0, before, 1), 0)
-    v = new + beta * v
-    return jnp.where(restart | (jnp.vdot(new, v) <= 0), new, v)
-
-
-def conjugate_gradients(problem: Problem) -> Solve:
-    """Compiles the derivatives; the loop runs on the host, as the line search may end early."""
     flat = Flat(problem)
-    of = Aggregate(flat)
+    evaluations = 2 * pairs * (1 if slope == "fischer" else flat.size)
+    sigma = falling(flat, sigma_end, fall or problem.budget.evaluations / evaluations)
+    gradient = SLOPES[slope](flat, pairs)
+    optim = optax.adam(rate * problem.sigma)
+
+    @jax.jit
+    def move(key, width, x, state):
+        updates, state = optim.update(gradient(key, width, x), state, x)
+        return flat.clip(x + updates), state
+
+    return flat.iterate(lambda key, i, x, state: move(key, sigma(i), x, state), optim.init)
+
+
+def conjugate_gradients(
+    problem: Problem,
+    second: Literal["hessian", "elements", "aggregate"],
+    *,
+    pairs: int = PAIRS,
+    trust: float = TRUST,
+    line_search: int = LINE_SEARCH,
+    tolerance: float = TOLERANCE,
+    recompute: int = RECOMPUTE,
+    sigma_end: float = SIGMA_END,
+    fall: int | None = None,
+) -> Solve:
+    """Compiles the derivatives; the loop runs on the host, as the line search may end early.
+
+    Args:
+        problem: The problem.
+        second: A sampled Hessian, or products as differences of gradients by elements or aggregate.
+        pairs: Of samples, for each element that is sampled.
+        trust: The longest step along a line, in units of sigma, and of the first one with Hessians.
+        line_search: Steps along a line.
+        tolerance: Of a squared step, that ends it, in units of the first sigma squared.
+        recompute: Iterations after which v starts again.
+        sigma_end, fall: As for `first_order`. By default sigma falls over the evaluations.
+    """
+    flat, first = Flat(problem), problem.sigma
+    slope = SLOPES["aggregate" if second == "aggregate" else "elements"](flat, pairs)
+    product = _hessian(flat, pairs) if second == "hessian" else _difference(slope)
+    n = 1 if second == "aggregate" else flat.size
+    sets = n * (n + 1) // 2 if second == "hessian" else 2 * n
+    of_gradient, of_step = 2 * pairs * n, 2 * pairs * (n + sets)
+    sigma = falling(flat, sigma_end, fall or 1)
+
+    @jax.jit
+    def along(key, width, x, v):
+        """A step along v, and its length squared."""
+        for_product, for_slope = jax.random.split(key)
+        hv, g = product(for_product, width, x, v), slope(for_slope, width, x)
+        return _move(flat, x, v, g, hv, trust * (first if second == "hessian" else width))
+
+    residual = jax.jit(lambda key, width, x: -slope(key, width, x))
 
     def solve(y0, key, record):
         keys = (jax.random.fold_in(key, i) for i in itertools.count())
         x = jnp.asarray(flat.start(y0), flat.dtype)
-        sigma = sigma_at(flat, 0)
-        r = v = -of.gradient(next(keys), sigma, x)
-        used = AGGREGATE
-        for i in itertools.count(1):
-            sigma = sigma_at(flat, used)
-            for _ in range(LINE_SEARCH):
-                g = of.gradient(next(keys), sigma, x)
-                hv = of.product(next(keys), sigma, x, v)
-                used += 3 * AGGREGATE
-                x, moved = _move(x, v, g, hv, RADIUS * sigma, flat.low, flat.high)
-                if moved <= TOLERANCE * sigma:
+        r = v = residual(next(keys), sigma(0), x)
+        used, since = of_gradient, 0
+        for i in itertools.count():
+            width = sigma(i if fall else used / problem.budget.evaluations)
+            for _ in range(line_search):
+                x, squared = along(next(keys), width, x, v)
+                used += of_step
+                if squared <= tolerance * first**2:
                     break
-            new = -of.gradient(next(keys), sigma, x)
-            used += AGGREGATE
-            r, v = new, _turn(r, v, new, i % RECOMPUTE == 0)
+            new = residual(next(keys), width, x)
+            used, since = used + of_gradient, since + 1
+            v, again = _turn(r, v, new, since >= recompute)
+            r, since = new, 0 if again else since
             record(flat.tree(x))
 
     return solve
 
 
+def _hessian(flat: Flat, pairs: int):
+    """(key, sigma, x, v) -> H v by a whole sampled Hessian."""
+    hessian, options = sd.Importance(2), {"num_samples": 2 * pairs, "baseline": "none"}
+    return lambda key, sigma, x, v: hessian(flat.loss, sigma, **options)(key, x) @ v
+
+
+def _difference(slope: Slope):
+    """(key, sigma, x, v) -> H v, of two slopes that see other random numbers."""
+
+    def product(key, sigma, x, v):
+        length = jnp.maximum(jnp.linalg.norm(v), jnp.finfo(v.dtype).tiny)
+        gradient = lambda key, x: slope(key, sigma, x)
+        shifted = sd.difference_hvp(gradient, SHIFT, shared=False)
+        return shifted(key, x, v * (sigma / length)) * (length / sigma)
+
+    return product
+
+
+def _move(flat: Flat, x, v, g, hv, radius):
+    """One step along v, and its length squared."""
+    curvature, length = jnp.vdot(v, hv), jnp.linalg.norm(v)
+    step = -jnp.vdot(g, v) / jnp.where(curvature > 0, curvature, 1)
+    far = radius / jnp.maximum(length, jnp.finfo(v.dtype).tiny)
+    step = jnp.clip(step, -far, far)
+    return flat.clip(x + step * v), (step * length) ** 2
+
+
+@jax.jit
+def _turn(r, v, new, restart):
+    """The next direction, conjugate or the residual itself, and whether it is that."""
+    before = jnp.vdot(r, r)
+    beta = jnp.where(before > 0, jnp.vdot(new, new) / jnp.where(before > 0, before, 1), 0)
+    v = new + beta * v
+    again = restart | (jnp.vdot(new, v) <= 0)
+    return jnp.where(again, new, v), again
+
+
+fischer_fr22 = partial(first_order, slope="fischer")
+wang_g = partial(first_order, slope="elements")
+wang_h = partial(conjugate_gradients, second="hessian")
+wang_hvp = partial(conjugate_gradients, second="elements")
+wang_hvpa = partial(conjugate_gradients, second="aggregate")
+
+GRID = {"pairs": (1, 2, 4), "trust": (1.0, 2.0, 4.0), "line_search": (1, 2, 4)}
 METHODS = {
-    "our_gradient": MethodEntry(
-        "Importance-sampled gradient, Adam (OurG)", ("scene",), our_gradient
+    "fischer_fr22": MethodEntry(
+        "Gradients, constant rate (Fischer-FR22)", (), fischer_fr22, {"rate": (0.1, 0.2, 0.4)}
     ),
-    "our_hvpa": MethodEntry(
-        "Conjugate gradients, aggregate (OurHVPA)",
+    "wang_g": MethodEntry("Importance-sampled gradient, Adam (Wang-G)", ("scene",), wang_g),
+    "wang_h": MethodEntry("Conjugate gradients, Hessians (Wang-H)", (), wang_h, GRID),
+    "wang_hvp": MethodEntry("Conjugate gradients, products (Wang-HVP)", (), wang_hvp, GRID),
+    "wang_hvpa": MethodEntry(
+        "Conjugate gradients, aggregate (Wang-HVPA)",
         ("scene", "large", "function"),
-        conjugate_gradients,
+        wang_hvpa,
+        GRID,
     ),
 }

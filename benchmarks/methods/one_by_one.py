@@ -30,17 +30,18 @@ class OneByOne:
         return value
 
 
-def nelder_mead(problem: Problem) -> Solve:
-    """The first simplex has edges of sigma, into the room that the bounds leave."""
+def nelder_mead(problem: Problem, *, edge: float = 1.0) -> Solve:
+    """The edges of the first simplex, in units of sigma, lead to where the bounds leave room."""
     from scipy import optimize
 
     flat = Flat(problem)
+    first = edge * problem.sigma
 
     def solve(y0, key, record):
         start = flat.start(y0)
-        room = np.where(start + problem.sigma <= flat.box[1], 1, -1)
+        room = np.where(start + first <= flat.box[1], 1, -1)
         options = {
-            "initial_simplex": start + problem.sigma * np.vstack([0 * start, np.diag(room)]),
+            "initial_simplex": start + first * np.vstack([0 * start, np.diag(room)]),
             "adaptive": True,
             "xatol": TOLERANCE * problem.sigma,
             "fatol": np.inf,  # on a plateau all values are the same
@@ -76,16 +77,16 @@ def annealing(problem: Problem) -> Solve:
     return solve
 
 
-def py_bobyqa(problem: Problem) -> Solve:
+def py_bobyqa(problem: Problem, *, first: float = 1.0) -> Solve:
     """A trust region on quadratic interpolation. Its licence is the GPL.
 
-    The first radius is sigma, if there is room; it restarts where its radius has shrunk, with
-    NumPy's global random numbers, so that restarts are not tied to the key.
+    The first radius is in units of sigma, if there is room; it restarts where its radius has
+    shrunk, with NumPy's global random numbers, so that restarts are not tied to the key.
     """
     pybobyqa = package("pybobyqa", "Py-BOBYQA")
     flat = Flat(problem)
     low, high = flat.box
-    radius = min(problem.sigma, 0.49 * float(np.min(high - low)))
+    radius = min(first * problem.sigma, 0.49 * float(np.min(high - low)))
 
     def solve(y0, key, record):
         with warnings.catch_warnings(action="ignore"):  # singular systems, on plateaus
@@ -103,8 +104,9 @@ def py_bobyqa(problem: Problem) -> Solve:
     return solve
 
 
+WIDTHS = (0.5, 1.0, 2.0)
 METHODS = {
-    "nelder_mead": MethodEntry("Nelder-Mead (SciPy)", ("scene",), nelder_mead),
+    "nelder_mead": MethodEntry("Nelder-Mead (SciPy)", ("scene",), nelder_mead, {"edge": WIDTHS}),
     "annealing": MethodEntry("Simulated annealing (SciPy)", ("scene", "program"), annealing),
-    "py_bobyqa": MethodEntry("Py-BOBYQA", (), py_bobyqa),
+    "py_bobyqa": MethodEntry("Py-BOBYQA", (), py_bobyqa, {"first": WIDTHS}),
 }

@@ -22,9 +22,12 @@ FIRST_STEP = 0.1  # in units of sigma
 PILOTS = 5
 
 
-def prepare(problem: Problem) -> Solve:
-    """Compiles the two evaluations of a step, and the step."""
-    flat, sigma = Flat(problem), problem.sigma
+def prepare(problem: Problem, *, first: float = FIRST_STEP, width: float = 1.0) -> Solve:
+    """Compiles the two evaluations of a step, and the step.
+
+    The first step and the first perturbation are in units of sigma.
+    """
+    flat, wide = Flat(problem), width * problem.sigma
     before = STABILITY * problem.budget.evaluations / 2 + 1
 
     @jax.jit
@@ -36,7 +39,7 @@ def prepare(problem: Problem) -> Solve:
 
     @jax.jit
     def step(key, x, i, gain):
-        along, diagonal = slope(key, x, sigma / (i + 1) ** WIDTH_DECAY)
+        along, diagonal = slope(key, x, wide / (i + 1) ** WIDTH_DECAY)
         return flat.clip(x - gain / (i + before) ** STEP_DECAY * along * diagonal)
 
     def solve(y0, key, record):
@@ -44,9 +47,10 @@ def prepare(problem: Problem) -> Solve:
         keys = (jax.random.fold_in(key, i) for i in itertools.count())
         size = 0.0
         while size == 0:  # on a plateau a slope says nothing
-            size = sum(abs(float(slope(next(keys), x, sigma)[0])) for _ in range(PILOTS))
+            size = sum(abs(float(slope(next(keys), x, wide)[0])) for _ in range(PILOTS))
             record(flat.tree(x))
-        gain = jnp.asarray(FIRST_STEP * sigma * before**STEP_DECAY * PILOTS / size, flat.dtype)
+        gain = first * problem.sigma * before**STEP_DECAY * PILOTS / size
+        gain = jnp.asarray(gain, flat.dtype)
         for i in itertools.count():
             x = step(next(keys), x, jnp.asarray(i, flat.dtype), gain)
             record(flat.tree(x))
@@ -54,4 +58,5 @@ def prepare(problem: Problem) -> Solve:
     return solve
 
 
-METHODS = {"spsa": MethodEntry("SPSA", ("scene", "large", "program"), prepare)}
+GRID = {"first": (0.1, 0.2, 0.4), "width": (0.5, 1.0, 2.0)}
+METHODS = {"spsa": MethodEntry("SPSA", ("scene", "large", "program"), prepare, GRID)}
