@@ -15,9 +15,7 @@ NOTEBOOKS = ROOT / "notebooks"
 # where these say README they mean, on the site, the page with the same content
 PAGES = {"benchmarks/README.md": "../evidence.md", "CONTRIBUTING.md": "", "CHANGELOG.md": ""}
 LINK = re.compile(r"\]\(([^)#\s]+)")
-EQUATION = re.compile(
-    r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL
-)
+EQUATION = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
