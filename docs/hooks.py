@@ -22,7 +22,9 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Adds the pages that lie elsewhere in the repository, and all that any page links to."""
     for name, readme in PAGES.items():
         text = (ROOT / name).read_text()
-        files.append(made(config, name, text.replace("](../README.md)", f"]({readme})")))
+        # on the site pages lie beside these, not in docs/
+        text = text.replace("](../README.md)", f"]({readme})").replace("](docs/", "](")
+        files.append(made(config, name, text))
     for path in sorted(NOTEBOOKS.glob("*.ipynb")):
         for name, content in as_pages(path):
             files.append(made(config, name, content))

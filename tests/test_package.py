@@ -50,7 +50,8 @@ def test_a_wheel_holds_the_library_alone(built):
 
 
 def test_an_sdist_holds_the_tests_and_pages(built):
-    names = tarfile.open(built[1]).getnames()
+    with tarfile.open(built[1]) as archive:
+        names = archive.getnames()
     inside = {name.partition("/")[2] for name in names}
     assert {"tests/test_package.py", "docs/index.md", "mkdocs.yml", "CITATION.cff"} <= inside
 
