@@ -45,6 +45,7 @@ def made(config: MkDocsConfig, name: str, content: str | bytes) -> File:
 def as_pages(path: Path) -> list[tuple[str, str | bytes]]:
     """A notebook as a page, and the pictures in it."""
     text, resources = MarkdownExporter().from_filename(str(path))
+    text = re.sub(r"\]\(([\w-]+)\.ipynb\)", r"](\1.md)", text)
     folder = f"notebooks/{path.stem}"
     for name in resources["outputs"]:
         text = text.replace(f"]({name})", f"]({path.stem}/{name})")
