@@ -34,3 +34,12 @@ def blocks(page: Path) -> list[Block]:
         Block(page, text[: m.start("code")].count("\n"), textwrap.dedent(m["code"]), m["why"])
         for m in _BLOCK.finditer(text)
     ]
+
+
+def sentences(page: Path) -> list[str]:
+    """The sentences of a page, without code, tables, headings and equations."""
+    text = re.sub(r"```.*?```|\$\$.*?\$\$", "", page.read_text(), flags=re.DOTALL)
+    prose = re.sub(r"^(\||#|    |---|<).*$", "", text, flags=re.MULTILINE)
+    paragraphs = re.split(r"\n\s*\n|^[-*] |^\d\. ", prose, flags=re.MULTILINE)
+    found = [s for part in paragraphs for s in re.split(r"(?<=[.!?:])\s+", part.strip())]
+    return [s for s in found if len(s.split()) > 2]

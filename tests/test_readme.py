@@ -3,6 +3,7 @@
 import ast
 import inspect
 import re
+import statistics
 import subprocess
 import sys
 from pathlib import Path
@@ -82,6 +83,12 @@ def test_readme_is_short():
     text = README.read_text()
     assert len(text.split()) <= 700
     assert max(len(line) for line in text.splitlines()) <= 100
+
+
+def test_sentences_are_short():
+    lengths = [len(s.split()) for page in [README, *DOCS] for s in pages.sentences(page)]
+    assert len(lengths) > 200
+    assert statistics.median(lengths) < 18
 
 
 @pytest.mark.parametrize("page", PAGES, ids=named)
