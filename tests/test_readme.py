@@ -1,55 +1,148 @@
-"""What README says to type works: its examples run, its commands and files are there."""
+"""What the pages say to type works: examples run, commands and files are there, names exist."""
 
-import json
+import ast
+import inspect
 import re
+import statistics
+import subprocess
+import sys
 from pathlib import Path
 
-import jax
-import numpy as np
+import pages
 import pytest
+from pages import DOCS, README, ROOT
 
+import smoothdiff as sd
 from benchmarks import __main__ as cli
 from benchmarks import _registry
+from smoothdiff.renderers import mitsuba
 
-ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", ROOT / "benchmarks" / "README.md", ROOT / "CONTRIBUTING.md"]
+ELSEWHERE = [ROOT / "benchmarks" / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"]
+PAGES = [README, *ELSEWHERE, *DOCS]
+CODE = [block for page in PAGES for block in pages.blocks(page)]
 SAID = r"python -m benchmarks ((?:[^`\n]|\n(?=[^\n]))*)"
+# pages that show their result in a picture
+START = "import matplotlib; matplotlib.use('agg')\n"
 
 
-@pytest.fixture
-def blocks():
-    return re.findall(r"```python\n(.*?)```", PAGES[0].read_text(), re.DOTALL)
+def named(page):
+    return str(page.relative_to(ROOT))
+
+
+def run(block, folder):
+    """Runs a block as its reader would: pasted into a file in an empty folder."""
+    (folder / "pasted.py").write_text(
+        block.code + "\n" if block.page == README else START + block.code
+    )
+    ran = subprocess.run([sys.executable, "pasted.py"], cwd=folder, capture_output=True, text=True)
+    missing = re.search(r"ModuleNotFoundError: No module named '(\w+)", ran.stderr)
+    if missing and missing[1] not in ("smoothdiff", "benchmarks"):
+        pytest.skip(f"{missing[1]} is not installed")
+    assert ran.returncode == 0, ran.stderr
+    return ran.stdout
 
 
 @pytest.mark.slow
-def test_examples_run_one_after_the_other(blocks):
-    names = {}
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        for block in blocks:
-            exec(block, names)
-            for said in re.findall(r"result\.y\)  # close to (\[.*\])", block):
-                np.testing.assert_allclose(names["result"].y, json.loads(said), atol=0.1)
+@pytest.mark.parametrize("block", [b for b in CODE if not b.why_not], ids=str)
+def test_examples_run_alone(block, tmp_path):
+    printed = run(block, tmp_path)
+    for said in re.findall(r"print\(.*\)  # close to \[(.*)\]", block.code):
+        shown = re.search(r"\[(.*?)\]", printed)
+        assert shown, printed
+        want, seen = (
+            [float(x) for x in re.split(r"[,\s]+", part.strip())] for part in (said, shown[1])
+        )
+        assert seen == pytest.approx(want, abs=0.1)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+@pytest.mark.parametrize("block", CODE, ids=str)
+def test_examples_use_names_that_exist(block):
+    tree = ast.parse(block.code)
+    assert "benchmarks" not in block.code, "pip installs no benchmarks"
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            module = {"sd": sd, "mitsuba": mitsuba}.get(node.value.id)
+            assert module is None or hasattr(module, node.attr), ast.unparse(node)
+        if isinstance(node, ast.Call):
+            check_arguments(node)
+
+
+def check_arguments(call):
+    """Arguments that are named exist, where a function of ours is called by its name."""
+    name = ast.unparse(call.func)
+    thing = getattr(sd, name.removeprefix("sd."), None) if name.startswith("sd.") else None
+    if thing is None or inspect.ismodule(thing):
+        return
+    taken = inspect.signature(thing).parameters
+    if any(p.kind is p.VAR_KEYWORD for p in taken.values()):
+        return
+    assert {k.arg for k in call.keywords if k.arg} <= set(taken), ast.unparse(call)
+
+
+def test_readme_is_short():
+    text = README.read_text()
+    assert len(text.split()) <= 700
+    assert max(len(line) for line in text.splitlines()) <= 100
+
+
+def test_sentences_are_short():
+    lengths = [len(s.split()) for page in [README, *DOCS] for s in pages.sentences(page)]
+    assert len(lengths) > 200
+    assert statistics.median(lengths) < 18
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
 def test_what_a_page_points_to_exists(page):
-    text = page.read_text()
-    headings = {
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if "://" in target:
+            continue
+        path, _, anchor = target.partition("#")
+        # the site has the repository's files beside the pages of docs/
+        places = [
+            page.parent / path,
+            *(folder / path for folder in (ROOT, ROOT / "docs", ROOT / "docs" / "x")),
+        ]
+        there = page if not path else next((p for p in places if p.resolve().exists()), None)
+        if there is None and Path(path).parent.name == "notebooks":
+            there = (ROOT / "notebooks" / Path(path).name).with_suffix(".ipynb")
+        assert there, target
+        assert there.exists(), target
+        if anchor and not anchor.startswith("smoothdiff."):
+            assert anchor in headings(there), target
+
+
+def headings(page):
+    return {
         re.sub(r"[^\w -]", "", line.lower()).strip().replace(" ", "-")
-        for line in text.splitlines()
+        for line in page.read_text().splitlines()
         if line.startswith("#")
     }
-    for target in re.findall(r"\]\(([^)]+)\)", text):
-        if target.startswith("#"):
-            assert target[1:] in headings
-        elif "://" not in target:
-            assert (page.parent / target.partition("#")[0]).exists(), target
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+@pytest.mark.parametrize("page", PAGES, ids=named)
 def test_commands_are_understood(page):
     for said in re.findall(SAID, page.read_text()):
         # any task stands for all where a page says TASK
         options = cli.parser().parse_args(re.sub(r"\bTASK\b", "led", said).split())
-        named = getattr(options, "methods", None)
-        assert not named or set(named.split(",")) <= set(_registry.methods()), said
+        methods = getattr(options, "methods", None)
+        assert not methods or set(methods.split(",")) <= set(_registry.methods()), said
+
+
+def test_the_api_pages_have_every_public_name():
+    shown = {
+        name
+        for page in (ROOT / "docs" / "api").glob("*.md")
+        for name in re.findall(r"^::: smoothdiff\.([\w.]+)", page.read_text(), re.MULTILINE)
+    }
+    modules = {name for name in sd.__all__ if inspect.ismodule(getattr(sd, name))}
+    want = set(sd.__all__) - modules
+    for module in [*(getattr(sd, name) for name in modules), mitsuba]:
+        local = module.__name__.removeprefix("smoothdiff.")
+        names = getattr(module, "__all__", None) or [
+            name
+            for name, thing in vars(module).items()
+            if inspect.isfunction(thing) and thing.__module__ == module.__name__ and name[0] != "_"
+        ]
+        want |= {f"{local}.{name}" for name in names}
+    assert shown == want

@@ -1,0 +1,64 @@
+"""What the site adds to mkdocs: MathML, notebooks, and what pages link to in the repository."""
+
+import html
+import posixpath
+import re
+from pathlib import Path
+
+from math_core import LatexToMathML
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from nbconvert import MarkdownExporter
+
+ROOT = Path(__file__).parents[1]
+NOTEBOOKS = ROOT / "notebooks"
+# where these say README they mean, on the site, the page with the same content
+PAGES = {"benchmarks/README.md": "../evidence.md", "CONTRIBUTING.md": "", "CHANGELOG.md": ""}
+LINK = re.compile(r"\]\(([^)#\s]+)")
+EQUATION = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Adds the pages that lie elsewhere in the repository, and all that any page links to."""
+    for name, readme in PAGES.items():
+        text = (ROOT / name).read_text()
+        # on the site pages lie beside these, not in docs/
+        text = text.replace("](../README.md)", f"]({readme})").replace("](docs/", "](")
+        files.append(made(config, name, text))
+    for path in sorted(NOTEBOOKS.glob("*.ipynb")):
+        for name, content in as_pages(path):
+            files.append(made(config, name, content))
+    for page in list(files.documentation_pages()):
+        for target in LINK.findall(page.content_string):
+            name = posixpath.normpath(posixpath.join(posixpath.dirname(page.src_uri), target))
+            lies = ROOT / name
+            if "://" not in target and files.get_file_from_path(name) is None and lies.is_file():
+                files.append(File.generated(config, name, abs_src_path=str(lies)))
+    return files
+
+
+def made(config: MkDocsConfig, name: str, content: str | bytes) -> File:
+    """A file of the site that is no file of the repository."""
+    return File.generated(config, name, content=content)
+
+
+def as_pages(path: Path) -> list[tuple[str, str | bytes]]:
+    """A notebook as a page, and the pictures in it."""
+    text, resources = MarkdownExporter().from_filename(str(path))
+    text = re.sub(r"\]\(([\w-]+)\.ipynb\)", r"](\1.md)", text)
+    folder = f"notebooks/{path.stem}"
+    for name in resources["outputs"]:
+        text = text.replace(f"]({name})", f"]({path.stem}/{name})")
+    pictures = [(f"{folder}/{name}", data) for name, data in resources["outputs"].items()]
+    return [(f"{folder}.md", text), *pictures]
+
+
+def on_page_content(content: str, **_: object) -> str:
+    """Equations in LaTeX become MathML, which browsers draw by themselves."""
+    convert = LatexToMathML().convert_with_local_state
+
+    def as_mathml(match: re.Match[str]) -> str:
+        tag, latex = match[1], html.unescape(match[2])
+        return f'<{tag} class="arithmatex">{convert(latex, displaystyle=tag == "div")}</{tag}>'
+
+    return EQUATION.sub(as_mathml, content)
