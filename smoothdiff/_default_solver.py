@@ -89,7 +89,7 @@ def _few_on_a_term(y: PyTree[Array], support: Any) -> bool:
     if support is None or isinstance(support, MovingSupport):
         return False
     on_each = np.asarray(support(jax.tree.map(jnp.ones_like, y)))
-    return float(np.sum(on_each)) <= _FEW * np.count_nonzero(on_each)
+    return bool(np.sum(on_each) <= _FEW * np.count_nonzero(on_each))
 
 
 def _is_none(leaf: Any) -> bool:

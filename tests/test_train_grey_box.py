@@ -51,8 +51,8 @@ def fails(at):
 
 def train(render=render, dtype: Any = np.float32, **rest):
     pictures = (POSES @ DRAWING.T).reshape(-1, 2, 2).astype(dtype)
-    call = {"key": jax.random.key(0), "sigma": 0.5, "optim": ADAM, "lessons": 16} | rest
-    call = {"max_evaluations": 16 * 2 * EACH * 5, "kept": 1024} | call
+    usual: dict[str, Any] = {"key": jax.random.key(0), "sigma": 0.5, "optim": ADAM, "lessons": 16}
+    call: dict[str, Any] = usual | {"max_evaluations": 16 * 2 * EACH * 5, "kept": 1024} | rest
     return sd.train_grey_box(Linear(jnp.zeros((2, 4), dtype)), render, pictures, **call)
 
 

@@ -203,7 +203,7 @@ class LocalCrossEntropy(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         wide = spread + share * (wide - spread)
         # where a parameter has moved nothing there is nothing to learn but that it is too narrow
         widest = jnp.minimum(_span(params), _WIDEST * params.sigma)
-        wide = jnp.where(flat, jnp.minimum(2 * spread, widest), wide)
+        wide: Array = jnp.where(flat, jnp.minimum(2 * spread, widest), wide)
         fun, stderr = population.loss()
 
         new_y = params.layout.tree(theta)
