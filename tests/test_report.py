@@ -179,7 +179,7 @@ def test_each_task_answers_one_question_for_each_peer_that_ran():
     assert of is not None
     assert of.value == pytest.approx(3)
     assert not many.close("evaluations")
-    near = [scene("d", newton_cg=(2, 5), cma_es=(3, 4))]
+    near = [scene("d", newton_cg=(2, 2, 3, 5, 5), cma_es=(3, 3, 4, 4, 4))]
     (only,) = (each for each in _finder.answers(near) if each.pairs)
     assert only.close("seconds")
     assert many.solved == (1, 1)
@@ -244,7 +244,9 @@ def test_a_film_has_what_was_found_within_so_many_evaluations(tmp_path):
     # a step is 15 evaluations: none is done after 10, one after 20, two after 40
     assert shot["errors"] == {"fr22": [1.0, 0.1, pytest.approx(0.01)]}
     _, half, whole = _atlas.frames(shot)["fr22"]
-    sought = _atlas.display(build(full=False).score.image(REFERENCE))
+    image = build(full=False).score.image
+    assert image is not None
+    sought = _atlas.display(image(REFERENCE))
     assert whole == pytest.approx(sought, abs=1 / 255)
     assert np.all(half < whole)
     results = of_scene({"fr22": 15, "spsa": 2})

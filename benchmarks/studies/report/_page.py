@@ -156,6 +156,7 @@ def of_scene(scene: Scene) -> dict[str, Any]:
         "cards": [pictures[k] for k in ("Start", scene.ours, "Reference") if k in pictures],
         "pictures": [pictures[k] for k in ("Reference", "Start", *named) if k in pictures],
         "more_pictures": [shown for key, shown in pictures.items() if key not in chosen],
+        "wide": _is_wide(scene),
         "film": _film(scene),
         "standing": [first(scene, cost) for cost in COSTS],
         "loses": loses(scene),
@@ -229,6 +230,12 @@ def _pictures(scene: Scene) -> dict[str, dict[str, str]]:
         caption = f"{name_of(name, scene.ran[name]['title'])}: {left} % left"
         found[name] = {"uri": uri(picture), "away": uri(away[name]), "caption": caption}
     return found
+
+
+def _is_wide(scene: Scene) -> bool:
+    """Whether pictures are so wide that they need two columns."""
+    stored = _atlas.stored(scene.results, list(scene.ran))
+    return stored is not None and stored.start.shape[1] > 2 * stored.start.shape[0]
 
 
 def _film(scene: Scene) -> list[dict[str, Any]]:
