@@ -31,6 +31,12 @@ def fault(x):
     return 2 * x
 
 
+def a_while(x):
+    """Takes x seconds."""
+    time.sleep(float(x))
+    return x
+
+
 def process(x):
     """The process that it is called in; x only makes it another call."""
     return np.int32(os.getpid())
