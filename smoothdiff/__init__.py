@@ -12,6 +12,7 @@ from smoothdiff._filtered_adam import filter_updates, filtered_adam, scale_by_fi
 from smoothdiff._gp import GaussianProcess
 from smoothdiff._host_samples import BlackBoxError
 from smoothdiff._importance import Importance, difference_hvp
+from smoothdiff._jaxlib import warn_if_it_can_hang
 from smoothdiff._large_steps import large_steps
 from smoothdiff._least_squares import LeastSquares
 from smoothdiff._minimise import least_squares, minimise
@@ -108,3 +109,6 @@ __all__ = [
     "surrogates",
     "with_covariance",
 ]
+
+warn_if_it_can_hang()
+del warn_if_it_can_hang
