@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypedDict
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
@@ -14,7 +15,8 @@ from smoothdiff._batch import Batch, evaluate
 from smoothdiff._estimate import combine, displacement, objective
 from smoothdiff._named_baselines import as_baseline
 from smoothdiff._noise import Noise, as_sampler
-from smoothdiff._params import Params, as_argnums, as_key, choose, replace, take_apart
+from smoothdiff._params import Params, as_argnums, as_key, choose, is_concrete, replace, take_apart
+from smoothdiff._reraise import reraise
 from smoothdiff._samplers import AbstractSampler
 from smoothdiff._support import as_support
 
@@ -178,3 +180,19 @@ def _positive(value: Any, name: str) -> int:
     if number < 1:
         raise ValueError(f"{name} must be a positive integer, not {value!r}")
     return number
+
+
+def compiled_once(g: Callable[..., Any]) -> Callable[..., Any]:
+    """A transformed function that is compiled once also where it is called outside of `jax.jit`.
+
+    There each call would compile its loop over the batch anew. What JAX cannot trace is static.
+    """
+    compiled = eqx.filter_jit(g)
+
+    def call(key: Any, *args: Any) -> Any:
+        if not all(map(is_concrete, jax.tree.leaves((key, args)))):
+            return g(key, *args)
+        with reraise():
+            return jax.block_until_ready(compiled(key, *args))
+
+    return call
