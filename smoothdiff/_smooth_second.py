@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh, NamedSharding
 from jaxtyping import Array, PyTree
 
 from smoothdiff._baselines import AbstractBaseline
@@ -29,6 +30,7 @@ def smooth_hessian(
     support: Callable[[PyTree], Array] | None = None,
     bounds: tuple[PyTree, PyTree] | None = None,
     batch_size: int | None = None,
+    sharding: Mesh | NamedSharding | None = None,
     nonfinite: Literal["propagate", "drop"] = "propagate",
     has_aux: bool = False,
     stderr: bool = False,
@@ -101,6 +103,7 @@ def smooth_hvp(
     support: Callable[[PyTree], Array] | None = None,
     bounds: tuple[PyTree, PyTree] | None = None,
     batch_size: int | None = None,
+    sharding: Mesh | NamedSharding | None = None,
     nonfinite: Literal["propagate", "drop"] = "propagate",
     has_aux: bool = False,
     stderr: bool = False,
@@ -179,6 +182,7 @@ def smooth_quadratic(
     support: Callable[[PyTree], Array] | None = None,
     bounds: tuple[PyTree, PyTree] | None = None,
     batch_size: int | None = None,
+    sharding: Mesh | NamedSharding | None = None,
     nonfinite: Literal["propagate", "drop"] = "propagate",
     has_aux: bool = False,
     stderr: bool = False,
