@@ -128,4 +128,7 @@ def _draw(name: str, folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except KeyboardInterrupt:
+        sys.exit("Interrupted; what was run is kept.")

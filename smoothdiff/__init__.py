@@ -14,6 +14,7 @@ from smoothdiff._grey_box import train_grey_box
 from smoothdiff._grey_result import GreyBoxError, GreyRecord, GreyResult
 from smoothdiff._host_samples import BlackBoxError
 from smoothdiff._importance import Importance, difference_hvp
+from smoothdiff._jaxlib import warn_if_it_can_hang
 from smoothdiff._large_steps import large_steps
 from smoothdiff._least_squares import LeastSquares
 from smoothdiff._minimise import least_squares, minimise
@@ -116,3 +117,6 @@ __all__ = [
     "train_grey_box",
     "with_covariance",
 ]
+
+warn_if_it_can_hang()
+del warn_if_it_can_hang

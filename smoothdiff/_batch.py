@@ -7,6 +7,7 @@ from typing import Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.sharding import NamedSharding
 from jaxtyping import Array, PyTree
 
 from smoothdiff._baselines import AbstractBaseline, Control
@@ -14,6 +15,7 @@ from smoothdiff._draws import Draws
 from smoothdiff._params import Layout, Params
 from smoothdiff._samplers import AbstractSampler
 from smoothdiff._seen import Seen
+from smoothdiff._sharding import shared_out
 from smoothdiff._support import AbstractSupport, check_support
 
 
@@ -51,6 +53,7 @@ def evaluate(
     baseline: AbstractBaseline,
     batch_size: int | None,
     nonfinite: Literal["propagate", "drop"],
+    sharding: NamedSharding | None = None,
     support: AbstractSupport | None = None,
     free_rows: list | None = None,
 ) -> Batch:
@@ -63,7 +66,9 @@ def evaluate(
     theta, sigma = jax.lax.stop_gradient((params.theta, params.sigma))
     extra = baseline.evaluations()
     try:
-        draws = Draws(sampler, key, num_samples - extra, theta.size, theta.dtype, batch_size)
+        draws = Draws(
+            sampler, key, num_samples - extra, theta.size, theta.dtype, batch_size, sharding
+        )
     except ValueError as error:
         if extra:
             error.add_note(f"{extra} of num_samples={num_samples} is for the baseline, f(theta)")
@@ -82,6 +87,7 @@ def evaluate(
         return values, aux, log_ratio
 
     values, aux, log_ratio = draws.map(rows)
+    values = shared_out(values, sharding)
     _check_values(values)
     center = None
     if baseline.slope:

@@ -71,7 +71,8 @@ def black_box(
         retries: How many times a call that failed is tried again. Takes no part in `on_nonfinite`.
         timeout: Seconds that a call may take. Needs an `executor`. `Processes` kill a worker that
             takes longer, and Dask does, and begin another one. A thread goes on, and is lost to its
-            pool, as is a process of another pool; once all are lost, an error says so.
+            pool, as is a process of another pool, or a worker of Dask's without a nanny; once all
+            are lost, an error says so.
         store: A file that keeps each point and its value as it comes. What is there is not
             evaluated again, whether the run went on, failed, was killed or is made once more; so
             `fun` must give the same value again. Neither errors nor NaN are kept. Several processes

@@ -5,8 +5,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypedDict
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh, NamedSharding
 from jaxtyping import Array, PyTree
 
 from smoothdiff._baselines import AbstractBaseline
@@ -14,8 +16,10 @@ from smoothdiff._batch import Batch, evaluate
 from smoothdiff._estimate import combine, displacement, objective
 from smoothdiff._named_baselines import as_baseline
 from smoothdiff._noise import Noise, as_sampler
-from smoothdiff._params import Params, as_argnums, as_key, choose, replace, take_apart
+from smoothdiff._params import Params, as_argnums, as_key, choose, is_concrete, replace, take_apart
+from smoothdiff._reraise import reraise
 from smoothdiff._samplers import AbstractSampler
+from smoothdiff._sharding import as_sharding
 from smoothdiff._support import as_support
 
 
@@ -46,6 +50,12 @@ class Options(TypedDict, total=False):
             sees points clamped to them; the weights see the points as drawn.
         batch_size: evaluate and differentiate at most so many samples at a time, which bounds the
             memory. The estimate is the same but for rounding.
+        sharding: devices that share out the samples: a `jax.sharding.Mesh` of one axis, or a
+            `NamedSharding` of one axis of a larger mesh. Each evaluates and keeps its part of them,
+            under `jax.jit`, and the sums over samples are combined. The same key gives the same
+            estimate on any number of devices, but for rounding. On several hosts, call
+            `jax.distributed.initialize()` first and make the mesh of `jax.devices()`; every process
+            then runs the same program. Not for a `black_box`, whose calls an `executor` shares out.
         nonfinite: "propagate" a NaN or infinite sample into the estimate, or "drop" it and
             re-weight the others; NaN if fewer than half are left.
         has_aux: the function returns (value, aux); aux comes back with one row per sample.
@@ -61,6 +71,7 @@ class Options(TypedDict, total=False):
     support: Callable[[PyTree], Array] | None
     bounds: tuple[PyTree, PyTree] | None
     batch_size: int | None
+    sharding: Mesh | NamedSharding | None
     nonfinite: Literal["propagate", "drop"]
     has_aux: bool
     stderr: bool
@@ -84,6 +95,7 @@ class Call:
     support: Any = None
     bounds: Any = None
     batch_size: Any = None
+    sharding: Any = None
     nonfinite: Any = "propagate"
     has_aux: Any = False
     stderr: Any = False
@@ -96,6 +108,7 @@ class Call:
         self.num_samples = _positive(self.num_samples, "num_samples")
         if self.batch_size is not None:
             self.batch_size = _positive(self.batch_size, "batch_size")
+        self.sharding = as_sharding(self.sharding)
         as_sampler(self.sampler, self.noise)
         extra = as_baseline(self.baseline).evaluations()
         if self.num_samples <= extra:
@@ -141,6 +154,7 @@ class Call:
             sampler=as_sampler(self.sampler, self.noise),
             baseline=as_baseline("mean" if plain else self.baseline),
             batch_size=self.batch_size,
+            sharding=self.sharding,
             nonfinite=self.nonfinite,
             support=as_support(self.support),
             free_rows=free_rows,
@@ -180,3 +194,19 @@ def _positive(value: Any, name: str) -> int:
     if number < 1:
         raise ValueError(f"{name} must be a positive integer, not {value!r}")
     return number
+
+
+def compiled_once(g: Callable[..., Any]) -> Callable[..., Any]:
+    """A transformed function that is compiled once also where it is called outside of `jax.jit`.
+
+    There each call would compile its loop over the batch anew. What JAX cannot trace is static.
+    """
+    compiled = eqx.filter_jit(g)
+
+    def call(key: Any, *args: Any) -> Any:
+        if not all(map(is_concrete, jax.tree.leaves((key, args)))):
+            return g(key, *args)
+        with reraise():
+            return jax.block_until_ready(compiled(key, *args))
+
+    return call

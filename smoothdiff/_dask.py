@@ -4,8 +4,11 @@ Dask is not imported: who has a client has imported it.
 """
 
 import concurrent.futures
+import contextlib
+import logging
 import os
 import signal
+import time
 import uuid
 import weakref
 from collections import OrderedDict
@@ -13,16 +16,23 @@ from typing import Any
 
 import numpy as np
 
-from smoothdiff._executors import AtOnce
+from smoothdiff._executors import AllHangError, AtOnce, CallLostError
 from smoothdiff._host_samples import Samples
 from smoothdiff._processes import Seconds
 
 # bytes of an array that the workers get once and not with each call, and how many they keep
 _LARGE, _KEPT = 1_000_000, 8
+# seconds without a worker after which that is said, and between two looks at a cluster
+_LONELY, _GLANCE = 60.0, 2.0
+
+
+_log = logging.getLogger("smoothdiff")
 
 
 class OnDask(AtOnce):
     """Calls on the workers of a Dask cluster, to which large arrays are sent once."""
+
+    glances_every = _GLANCE
 
     def __init__(self, client: Any):
         # Dask takes calls of the same function with the same arguments for one call, unless they
@@ -31,6 +41,9 @@ class OnDask(AtOnce):
         self._client = client
         self._sent: OrderedDict[bytes, Any] = OrderedDict()
         self._keys: weakref.WeakKeyDictionary[Any, str] = weakref.WeakKeyDictionary()
+        # of calls whose workers could not be ended
+        self._hung_keys: set[str] = set()
+        self._no_workers_since: float | None = None
 
     def _submit(self, fun: Any, samples: Samples, sample: int | None, timeout: Seconds) -> Any:
         args = (self._there(arg, samples) for arg in samples.arguments(sample))
@@ -49,12 +62,41 @@ class OnDask(AtOnce):
             return arg
         name = samples.digest(arg)
         if name not in self._sent:
-            self._client.wait_for_workers(1)
-            self._sent[name] = self._client.scatter(arg, broadcast=True)
+            self._sent[name] = self._scattered(arg)
         self._sent.move_to_end(name)
         while len(self._sent) > _KEPT:
             self._sent.popitem(last=False)
         return self._sent[name]
+
+    def _scattered(self, array: np.ndarray) -> Any:
+        while True:
+            with contextlib.suppress(TimeoutError):
+                self._client.wait_for_workers(1, timeout=_GLANCE)
+                return self._client.scatter(array, broadcast=True)
+            self._glance()
+
+    def _glance(self) -> None:
+        """Asks for the workers that a cluster has given up, and says so where there are none.
+
+        A cluster of Dask's forgets a worker that is not back 15 s after it died, or that has died
+        again by then, and begins no other one: in the end it would have none, and calls would wait
+        for ever.
+        """
+        cluster = self._client.cluster
+        wanted = getattr(cluster, "worker_spec", ())
+        if len(getattr(cluster, "workers", wanted)) < len(wanted):
+            cluster.scale(len(wanted))
+        now = time.monotonic()
+        if self._client.nthreads():
+            self._no_workers_since = None
+        elif self._no_workers_since is None:
+            self._no_workers_since = now
+        elif now - self._no_workers_since > _LONELY:
+            self._no_workers_since = float("inf")  # said once
+            _log.warning(
+                "the Dask cluster %s has had no worker for a minute; calls wait until it has one",
+                self._client.scheduler_info().get("address", ""),
+            )
 
     def _workers(self, future: Any) -> list[str]:
         key = self._keys[future]
@@ -66,14 +108,27 @@ class OnDask(AtOnce):
     def _result(self, future: Any, timeout: Seconds) -> Any:
         try:
             return super()._result(future, timeout)
-        except concurrent.futures.CancelledError:
+        except concurrent.futures.CancelledError as error:
             self._sent.clear()  # it went with the workers that had it
-            raise
+            raise CallLostError("the workers that had its arguments died") from error
 
     def _stop(self, future: Any) -> None:
         """Kills the worker; its nanny starts another one, and Dask makes its other calls again."""
         workers = self._workers(future)
         future.cancel()
+        if not workers:  # and to name none would name all
+            return
         kill = lambda dask_worker: os.kill(dask_worker.pid, signal.SIGKILL)
-        if workers:  # none would be all
-            self._client.run(kill, workers=workers, nanny=True, on_error="ignore")
+        if not self._client.run(kill, workers=workers, nanny=True, on_error="ignore"):
+            self._raise_if_all_hang()
+            self._hung_keys.add(self._keys[future])
+
+    def _raise_if_all_hang(self) -> None:
+        keys = self._hung_keys
+        count = lambda dask_worker: len(keys.intersection(dask_worker.active_threads.values()))
+        hung, threads = self._client.run(count, on_error="ignore"), self._client.nthreads()
+        if all(hung.get(worker, 0) >= count for worker, count in threads.items()):
+            raise AllHangError(
+                "no worker is left, each is in a call that took longer than the timeout, and has "
+                "no nanny that could begin another one: leave out --no-nanny, or processes=False"
+            )

@@ -5,9 +5,11 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.sharding import NamedSharding
 from jaxtyping import Array, PyTree
 
 from smoothdiff._samplers import AbstractSampler
+from smoothdiff._sharding import check_parts, shared_out
 
 
 @eqx.filter_jit  # without a jit of the caller's, compiling op by op takes seconds
@@ -44,9 +46,17 @@ class Draws(eqx.Module):
     chunk: int = eqx.field(static=True)
     impl: str = eqx.field(static=True)
     dtype: jnp.dtype = eqx.field(static=True)
+    sharding: NamedSharding | None = eqx.field(static=True)
 
     def __init__(
-        self, sampler: AbstractSampler, key: Array, num: int, n: int, dtype, batch_size: int | None
+        self,
+        sampler: AbstractSampler,
+        key: Array,
+        num: int,
+        n: int,
+        dtype,
+        batch_size: int | None,
+        sharding: NamedSharding | None = None,
     ):
         sampler.check(num, n)
         block = sampler.block(num, n)
@@ -57,13 +67,17 @@ class Draws(eqx.Module):
         # whole blocks only, and at least one
         chunk = num if batch_size is None else max(block, batch_size // block * block)
         self.chunk = min(num, chunk)
+        self.sharding = sharding
+        if sharding is not None:
+            for part in {self.chunk, num % self.chunk}:
+                check_parts(sharding, part, "the number of samples that are drawn together")
         self.kept = self._draw(0, num) if self.chunk == num else None
 
     def _draw(self, start, count: int):
         key = jax.random.wrap_key_data(self.key_data, impl=self.impl)
         z, log_ratio = _drawn(self.sampler, key, start, count, self.num, self.n, self.dtype)
         _check_weights(self.sampler, log_ratio)
-        return z, log_ratio
+        return shared_out((z, log_ratio), self.sharding)
 
     def _chunks(self, rows: PyTree) -> tuple[Array, PyTree, PyTree]:
         """Starts of the full chunks, their rows stacked, and the rows of the last, shorter one."""

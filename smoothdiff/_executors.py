@@ -21,8 +21,14 @@ class AllHangError(RuntimeError):
     """Every worker of a pool is in a call that cannot be ended."""
 
 
+class CallLostError(RuntimeError):
+    """A call was lost through no fault of its own."""
+
+
 # after these no call can be made
 _ENDS = concurrent.futures.BrokenExecutor, AllHangError, NotImportableError
+# how often a call that was lost is made again
+_LOSSES = 5
 # what may be raised and is a fault of one call; Ctrl-C is none
 FAULTS = Exception, SystemExit
 
@@ -80,7 +86,8 @@ class InTurn:
 class _Call:
     sample: int | None
     tries: int
-    future: Any
+    losses: int
+    future: Any = None
     # since when it is the oldest of those that have not come
     oldest_since: float | None = None
 
@@ -90,6 +97,8 @@ class AtOnce:
 
     # whether the executor itself ends calls that take too long
     keeps_time = False
+    # seconds of waiting after which it is looked at, None for never
+    glances_every: Seconds = None
 
     def __init__(self, executor: Any):
         self._executor = executor
@@ -124,9 +133,9 @@ class AtOnce:
         calls: dict[int, _Call] = {}
         tickets, patience = itertools.count(), None if self.keeps_time else timeout
 
-        def submit(sample: int | None, tries: int) -> None:
+        def submit(sample: int | None, tries: int, losses: int = 0) -> None:
             ticket = next(tickets)
-            calls[ticket] = _Call(sample, tries, None)
+            calls[ticket] = _Call(sample, tries, losses)
             try:
                 future = self._submit(fun, samples, sample, timeout)
             except RuntimeError as error:  # it was shut down, or is broken
@@ -152,7 +161,9 @@ class AtOnce:
                     value, error = None, fault
                     give_up(call)
                 del calls[ticket]
-                if error is not None and call.tries <= retries:
+                if isinstance(error, CallLostError) and call.losses < _LOSSES:
+                    submit(call.sample, call.tries, call.losses + 1)
+                elif error is not None and call.tries <= retries:
                     submit(call.sample, call.tries + 1)
                 else:
                     yield Outcome(call.sample, call.tries, value, error)
@@ -174,15 +185,23 @@ class AtOnce:
             if call.oldest_since is None:
                 call.oldest_since = now
             left = None if timeout is None else max(call.oldest_since + timeout - now, 0)
+            waits = [wait for wait in (left, self.glances_every) if wait is not None]
             try:
-                ticket = came.get(timeout=left)
+                ticket = came.get(timeout=min(waits, default=None))
             except queue.Empty:
+                if self.glances_every is not None:
+                    self._glance()
+                if left is None or time.monotonic() < now + left:
+                    continue
                 if call.future.done() or self._begun(call.future):
                     return oldest
                 call.oldest_since = None
             else:
                 if ticket in calls:  # else it was given up before
                     return ticket
+
+    def _glance(self) -> None:
+        """Sees that the executor has what it needs, while nothing comes."""
 
     def _submit(self, fun: Any, samples: Samples, sample: int | None, timeout: Seconds) -> Any:
         """The future of a call."""

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from smoothdiff._baselines import AbstractBaseline, Control
+from smoothdiff._columns import Columns
 from smoothdiff._draws import Draws
 from smoothdiff._leave_out import group_share, leave_out, left_out_group
 
@@ -103,40 +104,38 @@ class GaussianProcess(AbstractBaseline):
         gram = self._gram(draws) * (counts[:, None] * counts[None, :])
         unit = jnp.eye(draws.num, dtype=draws.dtype)
         factor = jax.scipy.linalg.cho_factor(gram + self.ridge * unit)
-        ones = jax.scipy.linalg.cho_solve(factor, counts)
+        columns = Columns(values, free * counts / jnp.sum(counts), counts)
+        small = columns.small
+        # all that is known yet in one solve
+        solved = jax.scipy.linalg.cho_solve(
+            factor, jnp.concatenate([counts[:, None], unit, small], axis=1)
+        )
+        ones, inverse, alpha = (
+            solved[:, 0],
+            solved[:, 1 : draws.num + 1],
+            solved[:, draws.num + 1 :],
+        )
         mean = free * ones / jnp.dot(counts, ones, precision="highest")
 
-        def solve(y: Array) -> tuple[Array, Array]:
+        def constrained(solved: Array, y: Array) -> tuple[Array, Array]:
             """The coefficients and the constant of the fit to values y."""
             constant = jnp.matmul(mean, y, precision="highest")
-            return jax.scipy.linalg.cho_solve(factor, y) - ones[:, None] * constant[None], constant
+            return solved - ones[:, None] * constant[None], constant
 
-        inverse, _ = solve(unit)
-        blocks = lambda index: inverse[index[:, :, None], index[:, None, :]]
-
-        def fit(v: Array) -> tuple[Array, ...]:
-            flat = v.reshape(draws.num, -1)
-            # the level first, or its rounding would be all that is left of small differences
-            level = jnp.matmul(
-                (free * counts / jnp.sum(counts)).astype(v.dtype), flat, precision="highest"
-            )
-            small = (flat - level[None]).astype(draws.dtype) * counts[:, None]
-            alpha, constant = solve(small)
-            left_out = leave_out(alpha, blocks, group or 1)
-            residual = self.ridge * alpha
-            if group is not None:
-                # every group's fit counts by its share of the samples, and is the fit to values
-                # that differ from the true ones by what it leaves of its own group
-                residual = left_out
-                alpha, constant = solve(small - left_out * share[:, None])
-            level += constant.astype(v.dtype)
-            rows = (a.astype(v.dtype).reshape(v.shape) for a in (residual, left_out, alpha))
-            return *rows, level.reshape(v.shape[1:])
-
-        leaves, treedef = jax.tree.flatten(values)
-        residual, left_out, alpha, level = (
-            treedef.unflatten(part) for part in zip(*map(fit, leaves), strict=True)
+        inverse, _ = constrained(inverse, unit)
+        alpha, constant = constrained(alpha, small)
+        left_out = leave_out(
+            alpha, lambda index: inverse[index[:, :, None], index[:, None, :]], group or 1
         )
+        residual = self.ridge * alpha
+        if group is not None:
+            # every group's fit counts by its share of the samples, and is the fit to values
+            # that differ from the true ones by what it leaves of its own group
+            residual = left_out
+            others = small - left_out * share[:, None]
+            alpha, constant = constrained(jax.scipy.linalg.cho_solve(factor, others), others)
+        residual, left_out, alpha = map(columns.rows, (residual, left_out, alpha))
+        level = jax.tree.map(lambda leaf: leaf[0], columns.with_level(constant[None]))
         return GPControl(residual, left_out, alpha, level, draws, self.length)
 
     def _gram(self, draws: Draws) -> Float[Array, "N N"]:

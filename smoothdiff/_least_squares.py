@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from smoothdiff._baselines import AbstractBaseline, Control
+from smoothdiff._columns import Columns
 from smoothdiff._draws import Draws
 from smoothdiff._gp import GaussianProcess
 from smoothdiff._leave_out import group_share, leave_out, left_out_group
@@ -99,29 +100,17 @@ class LeastSquares(AbstractBaseline):
             hat = jnp.einsum("bik,bjk->bij", part, part, precision="highest")
             return jnp.eye(index.shape[1], dtype=q.dtype)[None] - hat
 
-        def fit(v: Array) -> tuple[Array, ...]:
-            flat = v.reshape(draws.num, -1)
-            # the level first, or its rounding would be all that is left of small differences
-            level = jnp.matmul(
-                (counts / jnp.sum(counts)).astype(v.dtype), flat, precision="highest"
-            )
-            small = (flat - level[None]).astype(draws.dtype) * counts[:, None]
-            along = jnp.matmul(q.T, small, precision="highest")
-            residual = small - jnp.matmul(q, along, precision="highest")
-            left_out = leave_out(residual, blocks, group or 1)
-            if group is not None:
-                residual = left_out
-                weighted = left_out * group_share(counts, group)[:, None]
-                along = along - jnp.matmul(q.T, weighted, precision="highest")
-            beta = jax.scipy.linalg.solve_triangular(r, along).astype(v.dtype)
-            beta = beta.at[0].add(level)
-            rows = (a.astype(v.dtype).reshape(v.shape) for a in (residual, left_out))
-            return *rows, beta.reshape(-1, *v.shape[1:])
-
-        leaves, treedef = jax.tree.flatten(values)
-        residual, left_out, coefficients = (
-            treedef.unflatten(part) for part in zip(*map(fit, leaves), strict=True)
-        )
+        columns = Columns(values, counts / jnp.sum(counts), counts)
+        small = columns.small
+        along = jnp.matmul(q.T, small, precision="highest")
+        residual = small - jnp.matmul(q, along, precision="highest")
+        left_out = leave_out(residual, blocks, group or 1)
+        if group is not None:
+            residual = left_out
+            weighted = left_out * group_share(counts, group)[:, None]
+            along = along - jnp.matmul(q.T, weighted, precision="highest")
+        coefficients = columns.with_level(jax.scipy.linalg.solve_triangular(r, along))
+        residual, left_out = columns.rows(residual), columns.rows(left_out)
         return PolynomialControl(residual, left_out, coefficients, terms)
 
     def _terms(self, draws: Draws, left_out: int, *, may_drop: bool) -> Terms | None:

@@ -164,6 +164,11 @@ def take_apart(target: PyTree, sigma: PyTree, bounds: tuple[PyTree, PyTree] | No
     layout = Layout(
         treedef, tuple(x.shape for x in leaves), tuple(x.dtype for x in leaves), smoothed
     )
+    if not any(leaf.size for leaf, keep in zip(leaves, smoothed, strict=True) if keep):
+        raise ValueError(
+            "the smoothed parameters are empty, there is no number in them: pass arrays with at "
+            "least one entry"
+        )
     theta, width = layout.vector(leaves), layout.vector(sigmas)
     sigma_traced = not all(map(is_concrete, sigmas))
     checks = [
@@ -209,6 +214,12 @@ def _as_real(leaf: Any, name: str) -> Array:
             f"the smoothed parameter{name} has dtype {leaf.dtype}: pass real floating-point "
             "parameters (x.astype(float); round inside the function), or set sigma to None there"
         )
+    if jnp.finfo(leaf.dtype).bits < 32:
+        raise TypeError(
+            f"the smoothed parameter{name} has dtype {leaf.dtype}, which is too coarse to sample "
+            "around: pass x.astype(jnp.float32), and write x.astype(jnp."
+            f"{leaf.dtype}) inside the function"
+        )
     return leaf
 
 
@@ -235,6 +246,12 @@ def _check_sigma(sigma: Any, leaf: Array, name: str) -> None:
         raise ValueError(
             f"sigma{name} = {sigma}: the smoothing width must be positive and finite; "
             "use None for a leaf that is not to be smoothed"
+        )
+    small, large = (getattr(jnp.finfo(leaf.dtype), end) for end in ("tiny", "max"))
+    if np.any((width < small) | (width > large)):
+        raise ValueError(
+            f"sigma{name} = {sigma} is no normal number in {leaf.dtype}, which has those from "
+            f"{small:.3g} to {large:.3g}: use float64, or parameters in other units"
         )
     if is_concrete(leaf):
         # half a spacing either way rounds back to theta: every sample would be the same point

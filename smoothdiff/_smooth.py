@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
+from jax.sharding import Mesh, NamedSharding
 from jaxtyping import Array, PyTree
 
 from smoothdiff._baselines import AbstractBaseline
@@ -25,6 +26,7 @@ def smooth(
     support: Callable[[PyTree], Array] | None = None,
     bounds: tuple[PyTree, PyTree] | None = None,
     batch_size: int | None = None,
+    sharding: Mesh | NamedSharding | None = None,
     nonfinite: Literal["propagate", "drop"] = "propagate",
     has_aux: bool = False,
     stderr: bool = False,

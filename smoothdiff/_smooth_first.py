@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh, NamedSharding
 from jaxtyping import Array, PyTree
 
 from smoothdiff._baselines import AbstractBaseline
@@ -36,6 +37,7 @@ def smooth_value_and_grad(
     support: Callable[[PyTree], Array] | None = None,
     bounds: tuple[PyTree, PyTree] | None = None,
     batch_size: int | None = None,
+    sharding: Mesh | NamedSharding | None = None,
     nonfinite: Literal["propagate", "drop"] = "propagate",
     has_aux: bool = False,
     stderr: bool = False,
@@ -80,6 +82,7 @@ def smooth_grad(
     support: Callable[[PyTree], Array] | None = None,
     bounds: tuple[PyTree, PyTree] | None = None,
     batch_size: int | None = None,
+    sharding: Mesh | NamedSharding | None = None,
     nonfinite: Literal["propagate", "drop"] = "propagate",
     has_aux: bool = False,
     stderr: bool = False,
@@ -181,6 +184,7 @@ def smooth_jacobian(
     support: Callable[[PyTree], Array] | None = None,
     bounds: tuple[PyTree, PyTree] | None = None,
     batch_size: int | None = None,
+    sharding: Mesh | NamedSharding | None = None,
     nonfinite: Literal["propagate", "drop"] = "propagate",
     has_aux: bool = False,
     stderr: bool = False,

@@ -6,10 +6,11 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh, NamedSharding
 from jaxtyping import Array, PyTree
 
 from smoothdiff._baselines import AbstractBaseline
-from smoothdiff._call import Call
+from smoothdiff._call import Call, compiled_once
 from smoothdiff._estimate import displacement, objective
 from smoothdiff._noise import Noise
 from smoothdiff._params import choose, replace
@@ -29,6 +30,7 @@ def smooth_hessian(
     support: Callable[[PyTree], Array] | None = None,
     bounds: tuple[PyTree, PyTree] | None = None,
     batch_size: int | None = None,
+    sharding: Mesh | NamedSharding | None = None,
     nonfinite: Literal["propagate", "drop"] = "propagate",
     has_aux: bool = False,
     stderr: bool = False,
@@ -100,6 +102,7 @@ def smooth_hvp(
     support: Callable[[PyTree], Array] | None = None,
     bounds: tuple[PyTree, PyTree] | None = None,
     batch_size: int | None = None,
+    sharding: Mesh | NamedSharding | None = None,
     nonfinite: Literal["propagate", "drop"] = "propagate",
     has_aux: bool = False,
     stderr: bool = False,
@@ -137,7 +140,7 @@ def smooth_hvp(
     """
     call = Call(**locals())
 
-    def g(key: Any, x: PyTree, v: PyTree, *other_args: Any) -> PyTree:
+    def product(key: Any, x: PyTree, v: PyTree, *other_args: Any) -> PyTree:
         args = (x, *other_args)
         params = call.params(key, args)
         params.layout.check_vector(v)
@@ -148,12 +151,20 @@ def smooth_hvp(
                 grad = jax.grad(fun, call.shifted_argnums(len(args)), has_aux=True)
                 return grad(key, *replace(args, call.argnums, target))
 
-            _, product, aux = jax.jvp(gradient, (choose(args, call.argnums),), (v,), has_aux=True)
-            return call.out(product, aux)
+            _, tangent, aux = jax.jvp(gradient, (choose(args, call.argnums),), (v,), has_aux=True)
+            return call.out(tangent, aux)
         call.only_smoothed(params, "stderr of a Hessian-vector product")
         batch = call.batch(key, args, params, scalar=True)
         operator = HessianOperator(batch, params.sigma, params.layout)
         return call.out(operator.mv(v), batch.aux, operator.stderr(v))
+
+    if call.batch_size is None:
+        return product
+    compiled = compiled_once(product)
+
+    def g(key: Any, x: PyTree, v: PyTree, *other_args: Any) -> PyTree:
+        call.params(key, (x, *other_args)).layout.check_vector(v)
+        return compiled(key, *jax.tree.map(jnp.asarray, (x, v)), *other_args)
 
     return g
 
@@ -170,6 +181,7 @@ def smooth_quadratic(
     support: Callable[[PyTree], Array] | None = None,
     bounds: tuple[PyTree, PyTree] | None = None,
     batch_size: int | None = None,
+    sharding: Mesh | NamedSharding | None = None,
     nonfinite: Literal["propagate", "drop"] = "propagate",
     has_aux: bool = False,
     stderr: bool = False,

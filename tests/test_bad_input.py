@@ -297,3 +297,27 @@ def test_ad_of_smooth_sees_tracers_and_gives_nan():
     """`jax.grad` hides the value of the parameters, so nothing can be raised."""
     g = sd.smooth(boxes, 0.5, bounds=(0.15, 1.0), **PLAIN, num_samples=8)
     assert leaves_are(jnp.isnan, jax.grad(g, argnums=1)(KEY, X))
+
+
+@pytest.mark.parametrize("dtype", [jnp.float16, jnp.bfloat16])
+def test_coarse_parameters_are_an_error_that_says_what_to_write(dtype, key):
+    x = jnp.ones(2, dtype)
+    with pytest.raises(TypeError, match=r"pass x\.astype\(jnp\.float32\)"):
+        sd.smooth_grad(jnp.sum, 0.1)(key, x)
+    with pytest.raises(TypeError, match=f"x.astype.jnp.{x.dtype}. inside the function"):
+        sd.minimise(lambda y, _: jnp.sum(y), x, key=key, sigma=0.1, max_steps=1)
+
+
+def test_parameters_without_a_number_are_an_error(key):
+    for empty in (jnp.zeros(0), {"a": jnp.zeros((2, 0)), "b": jnp.zeros(0)}):
+        with pytest.raises(ValueError, match="the smoothed parameters are empty"):
+            sd.smooth(lambda x: 1.0, 0.1)(key, empty)
+    some = {"a": jnp.zeros(0), "b": jnp.zeros(2)}
+    g = sd.smooth_grad(lambda x: jnp.sum(x["b"]), 0.1, num_samples=8, baseline="mean")
+    assert jax.tree.map(jnp.shape, g(key, some)) == {"a": (0,), "b": (2,)}
+
+
+@pytest.mark.parametrize("sigma", [1e-39, 1e39])
+def test_a_sigma_that_is_no_normal_number_of_the_parameters_is_an_error(sigma, key):
+    with pytest.raises(ValueError, match=r"is no normal number in float32.* use float64"):
+        sd.smooth(jnp.sum, sigma)(key, jnp.zeros(2))

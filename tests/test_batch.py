@@ -287,3 +287,22 @@ def test_no_hessian_sized_array_unless_asked_for(key):
     assert largest(sd.smooth_grad(fun, 0.5, **options), key, x) <= 32 * 1000
     assert largest(sd.smooth_hvp(fun, 0.5, **options), key, x, x) <= 32 * 1000
     assert largest(model, key, x) <= 32 * 1000
+
+
+def test_products_in_chunks_are_compiled_once_outside_of_jit(key):
+    traced = []
+
+    def fun(x, scale):
+        traced.append(1)
+        return jnp.sum(jnp.abs(x)) * scale
+
+    options = {"num_samples": 8, "baseline": "mean", "batch_size": 4}
+    g = sd.smooth_hvp(fun, 0.1, **options)
+    first = g(key, jnp.ones(2), jnp.ones(2), 2.0)
+    count = len(traced)
+    assert not jnp.array_equal(first, g(jax.random.fold_in(key, 1), jnp.ones(2), jnp.ones(2), 2.0))
+    assert len(traced) == count
+    whole = sd.smooth_hvp(fun, 0.1, **{**options, "batch_size": None})
+    np.testing.assert_allclose(whole(key, jnp.ones(2), jnp.ones(2), 2.0), first, rtol=1e-4)
+    with pytest.raises(ValueError, match="v must have the structure and shapes"):
+        g(key, jnp.ones(2), jnp.ones(3), 2.0)

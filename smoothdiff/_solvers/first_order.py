@@ -34,17 +34,21 @@ from smoothdiff._solvers._random_numbers import in_step
 
 # so many small updates in a row count as convergence: under noise a single one is luck
 _PATIENCE = 5
+# so many batches in a row that have lost most of their samples are drawn again
+_TRIES = 5
 # the share of the newest iterate in the running average
 _NEWEST = 0.1
 
 
 class FirstOrderState(eqx.Module):
-    """The state of `FirstOrder`: with an average of the iterates and a count of small updates."""
+    """The state of `FirstOrder`: with an average of the iterates and counts of steps in a row."""
 
     progress: Progress
     opt_state: PyTree
     average: PyTree[Array]
+    # small updates, and batches that were lost
     stall: Int[Array, ""]
+    lost: Int[Array, ""]
 
 
 class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
@@ -69,7 +73,9 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
         sampler: where to sample.
         baseline: what to subtract, as for `smooth`.
         batch_size: evaluate at most so many samples at a time, as for `smooth`.
-        nonfinite: "propagate" or "drop" samples that are NaN or infinite, as for `smooth`.
+        nonfinite: "propagate" or "drop" samples that are NaN or infinite, as for `smooth`. A step
+            that has lost more than half of its samples changes nothing, and the next one draws
+            others; the sixth in a row ends the run.
         rtol: relative tolerance. The run has converged when five updates in a row are below
             `atol + rtol * norm(y)`.
         atol: absolute tolerance. By default both are zero, and the run uses up its budget.
@@ -153,7 +159,7 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
         _, bounds = read_options(options)
         step = jnp.asarray(0, jnp.int32)
         take_apart(y, sigma_at(self.sigma, step), bounds)
-        return FirstOrderState(Progress.start(y, f_struct.dtype), self.optim.init(y), y, step)
+        return FirstOrderState(Progress.start(y, f_struct.dtype), self.optim.init(y), y, step, step)
 
     def step(self, fn, y, args, options, state: FirstOrderState, tags):
         """One batch, one update."""
@@ -178,9 +184,12 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
             finite, (new_y, opt_state, average), (y, state.opt_state, state.average)
         )
         sigma = sigma_at(self.sigma, progress.step)
-        progress = progress.after(y, fun, stderr, sigma, self.num_samples, finite, seen)
+        lost = jnp.where(finite, 0, state.lost + 1)
+        stall = jnp.where(finite, stall, state.stall)
+        again = (lost <= _TRIES) if self.nonfinite == "drop" else finite
+        progress = progress.after(y, fun, stderr, sigma, self.num_samples, finite | again, seen)
         # the function was never evaluated at y itself, so its aux is that of a sample near y
-        return new_y, FirstOrderState(progress, opt_state, average, stall), seen.aux
+        return new_y, FirstOrderState(progress, opt_state, average, stall, lost), seen.aux
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """After small updates in a row, or a failed step."""
