@@ -26,6 +26,7 @@ def _ours(name: str, colour: str, dash: str = SOLID) -> Named:
 OURS = {
     "gauss_newton": _ours("GaussNewton", "#D9400B"),
     "newton_cg": _ours("NewtonCG", "#E88F00"),
+    "shortest_call": _ours("shortest call", "#9C3A00"),
     "first_order": _ours("FirstOrder", "#BF9A00"),
     "local_gauss_newton": _ours("LocalGaussNewton", "#E0285A"),
     "local_first_order": _ours("FirstOrder, support", "#BF9A00", DASHED),
@@ -54,7 +55,7 @@ OTHERS = {
     "wang_hvp": Named("Wang-HVP", "#3A9E94", DOTTED),
     "wang_hvpa": Named("Wang-HVPA", "#3A9E94"),
     "fischer_fr22": Named("Fischer-FR22, constant", "#A24FC4", DASHED),
-    "grey_our_gradient": Named("Wang-G, network", "#3A9E94", DASHED),
+    "grey_wang_g": Named("Wang-G, network", "#3A9E94", DASHED),
     "grey_aggregate": Named("Wang-G aggregate, network", "#3A9E94", DOTTED),
     "mitsuba_ad": Named("Mitsuba AD, Adam", "#5B7C99"),
     "spsa": Named("SPSA", "#5FA05F", DOTTED),
