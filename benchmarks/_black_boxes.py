@@ -16,7 +16,8 @@ from benchmarks._pictures import draw
 from benchmarks._study import setting
 from benchmarks._summary import summarise
 from benchmarks._tables import compare, ending, tables
-from benchmarks._task import Method, NotAble, Problem, Solve, precision_of
+from benchmarks._task import Method, NotAble, Problem, Solve, Task, precision_of
+from benchmarks._tune import tune
 
 __all__ = ["compare", "draw", "ending", "forgiving", "measure", "tables", "usual"]
 
@@ -42,7 +43,9 @@ def measure(name: str, options: Namespace, folder: Path, bar: tqdm | None = None
     how = {"setting": setting(options), "fresh": options.fresh, "progress": bar}
     for task in _registry.family(name, options.full):
         seeds = range(options.seeds or task.seeds)
-        runs = _loop.run(task, methods, seeds, folder / "raw" / task.name, keep=keep, **how)
+        best = _best(task, methods, folder / "tuned" / task.name) if options.tuned else []
+        raw = folder / "raw" / task.name
+        runs = _loop.run(task, [*methods, *best], seeds, raw, keep=keep, **how)
         with precision_of(task):
             ran = _loop.able(runs)
             shown = {"pictures": _atlas.rendered(task, ran)}
