@@ -108,7 +108,8 @@ def test_float64(x64):
     result = train(dtype=np.float64, max_evaluations=16 * 2 * EACH * 2)
     assert result.model.weight.dtype == np.float64
     assert result.parameters["y"].dtype == np.float64
-    assert np.max(result.losses) < 1e-4
+    # in two rounds most cases are solved, to more digits than float32 has
+    assert np.median(result.losses) < 1e-20
 
 
 def test_a_sigma_for_each_parameter_and_a_target():
