@@ -92,7 +92,9 @@ class CaseSearches(eqx.Module):
 
     def chosen(self, number: Int[Array, ""]) -> Int[Array, " drawn"]:
         """The cases whose turn it is in a round."""
-        return (number * self.drawn + jnp.arange(self.drawn)) % len(self.pictures)
+        return (number * self.drawn + jnp.arange(self.drawn, dtype=number.dtype)) % len(
+            self.pictures
+        )
 
     @eqx.filter_jit
     def begin(self, key: Key[Array, ""], said: Float[Array, "cases n"]) -> tuple[Known, Rendered]:

@@ -177,5 +177,5 @@ def lessons_of(number: int, planned: int, each: int) -> int:
 
     In the mean over all that are planned, `each`.
     """
-    share = min(number / max(planned - 1, 1), 1.0)
+    share = min(number / (planned - 1), 1.0) if planned > 1 else 0.5
     return max(round(each * (_FIRST + (_LAST - _FIRST) * share)), 1)
