@@ -208,9 +208,9 @@ def test_a_program_is_tuned_on_other_starts_and_kept(tmp_path):
     program = _equal.Program(task, "fr22", fr22, tmp_path)
     best = program.tuned("annealed")
     files = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npz")}
-    assert {path.stem.split("-")[-2] for path in files} == {"1000", "1002"}
+    assert {path.stem.split("-")[-2] for path in files} == {"1000"}
     for rate in (best.settings["rate"] / 3, best.settings["rate"] * 3):
-        ends = program("annealed", rate, range(1000, 1004))[:, -1]
+        ends = program("annealed", rate, range(1000, 1002))[:, -1]
         assert np.exp(np.log(ends).mean()) >= best.cost * (1 - 1e-6)
     three, one = program("annealed", 0.45, [0, 1, 2]), program("annealed", 0.45, [2])
     np.testing.assert_allclose(three[2], one[0], rtol=1e-6)  # whoever is beside it
