@@ -57,7 +57,7 @@ def test_ratios_are_to_wang_hvpa_of_the_same_kind(tmp_path):
         "shortest_call": {"published": levels(4, 5)},
     }
     faster = [{"times": k, "took": levels(60 / k, 90)} for k in papers.FASTER]
-    found = {"title": "A task", "methods": methods, "faster": faster}
+    found = {"title": "A task", "lines": methods, "faster": faster}
     assert papers.ratio(found, "fischer_fr22", "90") == 2
     assert papers.ratio(found, "fischer_fr22", "99") is None
     results = {"starts": 6, "tasks": {"a": found}}

@@ -17,7 +17,7 @@ from tqdm import tqdm
 from benchmarks import _registry
 from benchmarks._grid import Grid, Row, short
 from benchmarks._levels import Race
-from benchmarks._style import COLOURS, panels
+from benchmarks._style import COLOURS, headed, panels
 from benchmarks._summary import quartiles
 from benchmarks._task import NotAble, Task
 from benchmarks._tune import SEEDS, tune
@@ -85,7 +85,7 @@ def _measure(task: Task, race: Race, options: Namespace) -> dict[str, Any]:
         {"times": k, "took": _took(race(fr22, starts, said | {"rate": k * said["rate"]}))}
         for k in FASTER
     ]
-    return {"title": task.title, "methods": methods, "faster": faster}
+    return {"title": task.title, "lines": methods, "faster": faster}
 
 
 def _around(said: dict[str, Any]) -> dict[str, list[float]]:
@@ -108,7 +108,7 @@ def _took(evaluations: np.ndarray) -> dict[str, Any]:
 
 def ratio(task: dict[str, Any], name: str, level: str, kind: str = "published") -> float | None:
     """Of the medians of a method and of Wang-HVPA, both at their settings of that kind."""
-    mine, base = (task["methods"][each].get(kind) for each in (name, BASE))
+    mine, base = (task["lines"][each].get(kind) for each in (name, BASE))
     if mine is None or base is None or None in (mine[level]["median"], base[level]["median"]):
         return None
     return mine[level]["median"] / base[level]["median"]
@@ -133,7 +133,7 @@ def tables(results: dict[str, Any]) -> Iterator[Grid]:
                 task["title"],
                 (
                     *(_cell(each["took"]["90"], results["starts"]) for each in task["faster"]),
-                    _cell(task["methods"][BASE].get("published", {}).get("90"), results["starts"]),
+                    _cell(task["lines"][BASE].get("published", {}).get("90"), results["starts"]),
                 ),
             )
             for task in results["tasks"].values()
@@ -142,10 +142,10 @@ def tables(results: dict[str, Any]) -> Iterator[Grid]:
 
 
 def _rows(task: dict[str, Any], starts: int) -> Iterator[Row]:
-    logs = task["methods"][BASE]["logs"]
+    logs = task["lines"][BASE]["logs"]
     yield Row(task["title"], ("",) * 5, strong=True)
     titles = NAMES | {"cma_es": "CMA-ES (pycma)", "shortest_call": "the shortest call (ours)"}
-    for name, line in task["methods"].items():
+    for name, line in task["lines"].items():
         pairs = zip(line.get("logs", ()), logs, strict=False)
         said = [mine / base if mine and base else None for mine, base in pairs]
         edge = "*" if line.get("at the edge") else ""
@@ -177,21 +177,33 @@ def draw(results: dict[str, Any], folder: Path) -> None:
     titles = [task["title"] for task in tasks.values()]
     with panels(folder / "papers.png", titles, 3, (3.4, 2.6)) as (drawn, axes):
         for axis, task in zip(axes.flat, tasks.values(), strict=False):
-            names = list(task["methods"])
+            names, most = list(task["lines"]), _most(task)
             for kind, colour in looks:
                 for place, name in enumerate(names):
-                    took = task["methods"][name].get(kind, {}).get("99")
+                    took = task["lines"][name].get(kind, {}).get("99")
                     if took is None or took["median"] is None:
                         continue
                     here = place + 0.16 * (2 * colour - 1)
-                    ends = [took["lower"], took["upper"] or 1e6]
+                    ends = [took["lower"], took["upper"] or most]
                     axis.hlines(here, *ends, color=COLOURS[colour], lw=4, alpha=0.4)
                     axis.plot(took["median"], here, "o", color=COLOURS[colour], ms=4)
             shown = NAMES | {"cma_es": "CMA-ES", "shortest_call": "ours"}
             axis.set(yticks=range(len(names)), yticklabels=[shown[name] for name in names])
             axis.set(xscale="log", ylim=(len(names) - 0.5, -0.5))
+            axis.set_xlim(right=most)
         for kind, colour in looks:
             label = "at the paper's settings" if kind == "published" else "at its best"
             axes.flat[0].plot([], [], "o", color=COLOURS[colour], label=label)
         drawn.legend(*axes.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
-        drawn.supxlabel("Evaluations to 99 % of the image error", fontsize=9)
+        headed(drawn, "Evaluations to 99 % of the image error: medians, from quartile to quartile")
+
+
+def _most(task: dict[str, Any]) -> float:
+    """A right end of the axis: beyond all numbers; what has no upper quartile goes on to it."""
+    kinds = [
+        line[kind]
+        for line in task["lines"].values()
+        for kind in ("published", "best")
+        if kind in line
+    ]
+    return 3 * max(took["99"][q] or 0 for took in kinds for q in ("median", "upper"))
