@@ -140,13 +140,15 @@ def draw(results: dict[str, Any], folder: Path) -> None:
     names = list(dict.fromkeys(line["function"] for line in results["lines"]))
     with figure(folder / "scale.png", 1, 3, (10, 3.6)) as (drawn, axes):
         for axis, (of, title) in zip(axes[0], titles, strict=True):
+            workers = sorted({line["workers"] for line in results["lines"]})
             for name, colour in zip(names, COLOURS, strict=False):
                 lines = [line for line in results["lines"] if line["function"] == name]
                 for way, dash in (("rounds", ":"), ("no waiting", "-")):
                     values = [line[way][of] or np.nan for line in lines]
-                    workers = [line["workers"] for line in lines]
                     axis.plot(
                         workers, values, dash, color=colour, marker=".", label=f"{name}, {way}"
                     )
             axis.set(xscale="log", yscale="log", xlabel="Workers", title=title)
+            axis.set_xticks(workers, [str(count) for count in workers], minor=False)
+            axis.tick_params(which="minor", bottom=False, labelbottom=False)
         drawn.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
