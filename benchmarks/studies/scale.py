@@ -25,8 +25,8 @@ from benchmarks.studies._listed import listed
 
 HELP = "4 to 1,024 simulated workers: rounds against a search that waits for none"
 OPTIONS = ("full", "seeds")
-STARTS = {False: 2, True: 10}
-WORKERS = {False: (4, 16, 64, 256), True: (4, 16, 64, 256, 1024)}
+STARTS = {False: 1, True: 10}
+WORKERS = {False: (4, 32, 256), True: (4, 16, 64, 256, 1024)}
 # a run ends at this share of the value at the start, or after so many evaluations for each worker
 LEFT, ROUNDS, LEAST = 1e-3, 20, 1000
 SPREAD = 1.0
@@ -104,7 +104,7 @@ def measure(options: Namespace, folder: Path) -> dict[str, Any]:
 
 def tables(results: dict[str, Any]) -> Iterator[Grid]:
     """A line for each function and number of workers."""
-    known = lambda value: float("inf") if value is None else value
+    shown = lambda value, scale: "-" if value is None else f"{scale * value:.3g}"
     yield listed(
         "Workers",
         f"Simulated durations are log-normal with mean 1 s; medians of {results['starts']} starts. "
@@ -117,7 +117,7 @@ def tables(results: dict[str, Any]) -> Iterator[Grid]:
                 "workers": line["workers"],
                 **{
                     title: " / ".join(
-                        f"{scale * known(line[way][of]):.3g}" for way in ("rounds", "no waiting")
+                        shown(line[way][of], scale) for way in ("rounds", "no waiting")
                     )
                     for title, of, scale in (
                         ("a second", "a second", 1),
@@ -140,13 +140,15 @@ def draw(results: dict[str, Any], folder: Path) -> None:
     names = list(dict.fromkeys(line["function"] for line in results["lines"]))
     with figure(folder / "scale.png", 1, 3, (10, 3.6)) as (drawn, axes):
         for axis, (of, title) in zip(axes[0], titles, strict=True):
+            workers = sorted({line["workers"] for line in results["lines"]})
             for name, colour in zip(names, COLOURS, strict=False):
                 lines = [line for line in results["lines"] if line["function"] == name]
                 for way, dash in (("rounds", ":"), ("no waiting", "-")):
                     values = [line[way][of] or np.nan for line in lines]
-                    workers = [line["workers"] for line in lines]
                     axis.plot(
                         workers, values, dash, color=colour, marker=".", label=f"{name}, {way}"
                     )
             axis.set(xscale="log", yscale="log", xlabel="Workers", title=title)
+            axis.set_xticks(workers, [str(count) for count in workers], minor=False)
+            axis.tick_params(which="minor", bottom=False, labelbottom=False)
         drawn.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
