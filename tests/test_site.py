@@ -12,13 +12,6 @@ from pages import ROOT
 pytestmark = pytest.mark.slow
 # to subclass, to catch or to read; the reader makes none
 NOT_CALLED = {"AbstractBaseline", "AbstractSampler", "BlackBoxError", "Options"}
-    "AbstractBaseline",
-    "AbstractSampler",
-    "AbstractSpace",
-    "BlackBoxError",
-    "Noise",
-    "Options",
-}
 
 
 @pytest.fixture(scope="module")
