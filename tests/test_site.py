@@ -11,14 +11,7 @@ from pages import ROOT
 
 pytestmark = pytest.mark.slow
 # to subclass, to catch or to read; the reader makes none
-NOT_CALLED = {
-    "AbstractBaseline",
-    "AbstractSampler",
-    "AbstractSpace",
-    "BlackBoxError",
-    "Noise",
-    "Options",
-}
+NOT_CALLED = {"AbstractBaseline", "AbstractSampler", "BlackBoxError", "Options"}
 
 
 @pytest.fixture(scope="module")
