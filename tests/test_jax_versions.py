@@ -7,12 +7,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-# the oldest, those that can hang on a CPU, and the newest; with warnings as errors
-VERSIONS = ("jax==0.8.*", "jax==0.9.*", "jax==0.10.*", "jax")
+# the oldest; the newest that is allowed is installed. With warnings as errors
+VERSIONS = ("jax==0.8.*",)
 
 SCRIPT = """
-import warnings
-warnings.filterwarnings("ignore", "jaxlib .* can hang", RuntimeWarning)
 from concurrent.futures import ThreadPoolExecutor
 import jax, jax.numpy as jnp, numpy as np, optax
 import smoothdiff as sd
