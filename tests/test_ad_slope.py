@@ -30,9 +30,10 @@ EVALUATIONS = {"ad": 17, "mean": 18, "linear": 18}
 
 def loss(at):
     """Hard edges: AD by the light is exact, by the edges zero."""
-    pixels, lights, target = (jnp.asarray(a, jnp.float32) for a in (PIXELS, LIGHTS, TARGET))
+    pixels, lights = jnp.asarray(PIXELS, jnp.float32), jnp.asarray(LIGHTS, jnp.float32)
+    target = jnp.asarray(TARGET, jnp.float32)
     seen = (pixels > at["edges"][0]) & (pixels < at["edges"][1])
-    shown = jnp.where(seen, lights @ at["light"], 0)
+    shown: jax.Array = jnp.where(seen, lights @ at["light"], 0)
     return jnp.mean(jnp.square(shown - target))
 
 

@@ -27,6 +27,11 @@ def bars(pixels: int) -> sd.Level:
     return sd.Level(lambda y, args: residuals(y), float(pixels))
 
 
+def sine(cost: float) -> sd.Level:
+    """A level of this cost."""
+    return sd.Level(lambda y, args: jnp.sin(y), cost)
+
+
 class Counted:
     """A level whose calls are counted where they are evaluated."""
 
@@ -134,9 +139,9 @@ def test_a_space_holds_at_all_levels():
     [
         ([], {}, TypeError, "list of sd.Level"),
         ([lambda y, args: y], {}, TypeError, "list of sd.Level"),
-        ([sd.Level(jnp.sin, 2.0), sd.Level(jnp.sin, 1.0)], {}, ValueError, "not fall"),
-        ([sd.Level(jnp.sin, 0.0)], {}, ValueError, "positive"),
-        ([sd.Level(jnp.sin, float("nan"))], {}, ValueError, "positive"),
+        ([sine(2.0), sine(1.0)], {}, ValueError, "not fall"),
+        ([sine(0.0)], {}, ValueError, "positive"),
+        ([sine(float("nan"))], {}, ValueError, "positive"),
         ([bowls()[0].level], {"max_evaluations": 10}, ValueError, "max_cost"),
         ([bowls()[0].level], {"max_cost": float("nan")}, ValueError, "max_cost"),
         (

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from jax.core import Tracer
 
 import smoothdiff as sd
 from benchmarks import _descents, _registry, _study
@@ -123,7 +124,7 @@ def test_all_configurations_have_one_grid_of_rates_and_decays():
     seen = {}
 
     def build(rate, b1, b2, *, levels, sigma):
-        if not isinstance(b1, jax.core.Tracer):  # in the loop it is
+        if not isinstance(b1, Tracer):  # in the loop it is
             seen.update(b1=float(b1), b2=float(b2), levels=levels, sigma=float(sigma))
         return optax.sgd(rate)
 
@@ -202,9 +203,9 @@ def test_the_derivative_of_the_plate_is_that_of_its_picture():
 
 
 def test_one_moment_with_a_filter_that_does_nothing_is_adam():
-    same = lambda signal, guide: signal
+    same: Any = lambda signal, guide: signal
     for name in ("m", "v"):
-        mine: Any = texture.one_moment(name, 0.2, 0.36, same, 0.1)
+        mine: Any = texture.one_moment(name, lambda: same, 0.1, 0.2, 0.36)
         adam: Any = sd.filtered_adam(0.1, 0.2, 0.36)
         y = jnp.array([1.0, -2.0])
         state, theirs = mine.init(y), adam.init(y)

@@ -87,6 +87,7 @@ def test_an_error_names_the_point_and_a_second_run_pays_for_nothing(kind, call, 
     if way[0] == "dask":
         pytest.skip("as with processes")
     fun = host_functions.Faulty(tmp_path / "calls", (kind,), call == "least_squares")
+    faults: set = set()
     for _ in range(2):
         with pytest.raises(sd.MinimiseError) as info:
             search(call, fun, 0, way, tmp_path / "store")

@@ -1,5 +1,7 @@
 """The Mitsuba renderer: pictures as Mitsuba makes them, that follow from the parameters alone."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import mitsuba as mi
@@ -173,7 +175,8 @@ def turn(vector):
 
 def test_without_an_axis_a_rotation_is_a_vector():
     turns = mitsuba.renderer(scene(), ["cube.rotate", "board.rotate"], axis={"board": (0, 0, 1)})
-    assert {name: value.shape for name, value in turns.initial.items()} == {
+    initial: Any = turns.initial
+    assert {name: value.shape for name, value in initial.items()} == {
         "cube.rotate": (3,),
         "board.rotate": (),
     }

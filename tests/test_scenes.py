@@ -15,7 +15,7 @@ from benchmarks.scenes import _mitsuba_ad
 from benchmarks.tasks import mug
 from smoothdiff.renderers import mitsuba
 
-SCENES = [name for name, (_, kind, _) in _registry.tasks().items() if kind == "scene"]
+SCENES = [name for name, entry in _registry.tasks().items() if entry.kind == "scene"]
 SCENES.remove("brdf")  # which Mitsuba has no part in
 
 

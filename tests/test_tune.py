@@ -1,5 +1,7 @@
 """The best of a grid: it is found, it is inside, and starts that are scored are not looked at."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -78,7 +80,8 @@ WALK = Method("walk", "Walk", walk, "source")
 def test_a_race_counts_evaluations_to_each_level_and_keeps_them(tmp_path):
     race = Race(line(), tmp_path)
     assert race(WALK, [0, 1], {"rate": 1.0}).tolist() == [[9, 10]] * 2
-    stopped = Method("walk", "Walk", lambda problem, rate: 1 / 0, "source")
+    fails: Any = lambda problem, rate: 1 / 0
+    stopped = Method("walk", "Walk", fails, "source")
     assert race(stopped, [0, 1], {"rate": 1.0}).tolist() == [[9, 10]] * 2  # from their files
     assert np.isinf(Race(line(5), tmp_path / "short")(WALK, [0])).all()
 
@@ -105,7 +108,7 @@ def test_tuning_takes_other_starts_than_those_scored(tmp_path):
 
 
 def test_what_is_fixed_stays(tmp_path):
-    fast = lambda problem, *, rate, times: walk(problem, rate=rate * times)
+    fast: Any = lambda problem, *, rate, times: walk(problem, rate=rate * times)
     method = Method("fast", "Fast", fast, "")
     race = Race(line(), tmp_path)
     found = tune(race, method, {"rate": (0.5, 1.0, 2.0)}, SEEDS[:1], 1, {"rate": 9.0, "times": 10})

@@ -163,7 +163,10 @@ def test_starts_of_every_part_are_what_was_asked_for(monkeypatch, tmp_path):
 def test_ablations_are_ours_with_some_settings_changed():
     methods = ablations.methods()
     assert list(methods) == [*ablations.CHANGES, "fd", "fr22"]
-    made = {name: make(slope().problem, 0.5, optax.adam(0.1)) for name, make in methods.items()}
+    made = {
+        name: make(slope().problem, optax.constant_schedule(0.5), optax.adam(0.1))
+        for name, make in methods.items()
+    }
     settings = ("inner_sigma", "surrogate", "surrogate_steps", "local", "num_samples", "replay")
     for name, changes in ablations.CHANGES.items():
         for setting in settings:
