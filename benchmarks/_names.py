@@ -47,7 +47,7 @@ OTHERS = {
     "nelder_mead": Named("Nelder-Mead", "#008F6B"),
     "finite_differences": Named("Differences, Adam", "#7A9A2E"),
     "grey_differences": Named("Differences, network", "#7A9A2E"),
-    "fr22": Named("Fischer-FR22, annealed", "#A24FC4"),
+    "fr22": Named("Fischer-FR22", "#A24FC4"),
     "grey_fr22": Named("Fischer-FR22, network", "#A24FC4"),
     "zerograds": Named("Fischer-ZeroGrads", "#C45BAA", DASHED),
     "wang_g": Named("Wang-G", "#3A9E94", DASHED),

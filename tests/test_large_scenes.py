@@ -80,7 +80,7 @@ def test_a_texel_changes_only_its_support():
         (jnp.zeros_like(y).at[texel].set(1), 1 - 2 * y[texel])
         for texel in (0, 31, 300, 517, 992, 1023)
     ]
-    assert share_within("texture32", y, moves, 12 / 48**2) == 1
+    assert share_within("texture32", y, moves, 12 / 48**2) == pytest.approx(1, abs=1e-6)
     assert 0.1 < texture32.texture().min() < texture32.texture().max() < 0.9
 
 

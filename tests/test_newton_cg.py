@@ -207,8 +207,15 @@ def test_a_constant_function_ends_as_noise(dtype):
     assert 10 < result.history[-1].sigma < np.inf
 
 
-@pytest.mark.parametrize("seeds", [6, pytest.param(20, marks=pytest.mark.slow)])
-@pytest.mark.parametrize(("problem", "noise"), [(noisy, 0.1), (noisier, 1.0)])
+# the median of six runs with more noise than signal depends on the rounding of the machine
+@pytest.mark.parametrize(
+    ("problem", "noise", "seeds"),
+    [
+        (noisy, 0.1, 6),
+        pytest.param(noisy, 0.1, 20, marks=pytest.mark.slow),
+        pytest.param(noisier, 1.0, 20, marks=pytest.mark.slow),
+    ],
+)
 def test_noise_of_1_and_10_percent_of_the_range(problem, noise, seeds):
     # from (2, 2) to the target the function falls by 8.5
     args = args_of(problem, (0.5, -0.5), np.float32)
@@ -345,15 +352,16 @@ def test_runs_vmapped_on_vectors_are_single_ones_on_pytrees(x64):
     def final(seed):
         options = {"key": jax.random.key(seed)}
         args = jnp.zeros(2), jnp.asarray(target)
-        run = optx.minimise(quadratic, solver, *args, options, max_steps=12, throw=False)
+        run = optx.minimise(quadratic, solver, *args, options, max_steps=8, throw=False)
         return run.value, run.stats
 
     many, stats = jax.jit(jax.vmap(final))(jnp.arange(3))
     for seed, value in enumerate(many):
         run = solve(
-            quadratic, (0.0, 0.0), target, sigma=1.0, seed=seed, max_steps=12, dtype=np.float64
+            quadratic, (0.0, 0.0), target, sigma=1.0, seed=seed, max_steps=8, dtype=np.float64
         )
-        assert stats["evaluations"][seed] == run.evaluations == 12 + 2
+        # not yet converged, which rounding decides
+        assert stats["evaluations"][seed] == run.evaluations == 8 + 2
         assert stats["fun"][seed] == pytest.approx(run.fun, abs=1e-4)
         assert stats["smoothed"][seed] == pytest.approx(run.smoothed, abs=1e-4)
         assert run.y["b"][0].shape == (1,)

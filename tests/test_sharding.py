@@ -11,6 +11,7 @@ import pytest
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import smoothdiff as sd
+from tests.closed_forms import as_users_have_it
 
 SCRIPT = """
 import re, sys
@@ -86,7 +87,7 @@ def test_what_cannot_be_shared_out_is_an_error(key):
         with pytest.raises(ValueError, match="samples have one axis"):
             grad(NamedSharding(square, spec))
     with pytest.raises(TypeError, match=r"must be a mesh of devices, such as jax\.make_mesh"):
-        grad(jax.devices())
+        as_users_have_it(sd.smooth_grad)(jnp.sum, 0.1, num_samples=12, sharding=jax.devices())
     grad(NamedSharding(square, PartitionSpec("b")))(key, jnp.ones(2))
 
 

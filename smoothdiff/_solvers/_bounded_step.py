@@ -8,6 +8,7 @@ from smoothdiff._solvers._base import dot
 
 # steps along the bounds at most, and the shares of each that are tried and clipped
 _TIMES, _SHARES = 10, tuple(2.0**-k for k in range(6))
+_ROUNDING = 8
 # Newton's method on the length of the step: from below it is monotone, and nearly quadratic
 _SECULAR = 12
 
@@ -37,12 +38,15 @@ def bounded_step(
     reach = radius if shape is None else radius * _extent(shape)
     near, far = jnp.maximum(low, -reach), jnp.minimum(high, reach)
     shares = jnp.asarray(_SHARES, grad.dtype)
+    # a step to a bound ends there but for rounding
+    margin = _ROUNDING * jnp.finfo(grad.dtype).eps * (far - near)
 
     def again(carry: tuple) -> tuple:
         p: Array
         p, value, _, times = carry
         slope = grad + dot(hessian, p)
-        free = ~(((p <= near) & (slope > 0)) | ((p >= far) & (slope < 0)))
+        at_low, at_high = p <= near + margin, p >= far - margin
+        free = ~((at_low & (slope > 0)) | (at_high & (slope < 0)))
         step = _within(hessian, slope, radius, free, shape)
         crossed = jnp.any((p + step < low) | (p + step > high))
         room = jnp.where(step > 0, far - p, near - p)
