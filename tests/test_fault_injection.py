@@ -1,7 +1,8 @@
 """Host functions with a fault at one point in ten, under everything that makes calls.
 
 A run ends with an answer as good as without faults, or with an error that names the point, and a
-second one pays for no point twice. FAULT_RUNS=50 in the environment makes 50 runs of each, under all executors.
+second one pays for no point twice. FAULT_RUNS=50 in the environment makes 50 runs of each, under
+all executors.
 """
 
 import contextlib
