@@ -1,6 +1,5 @@
 """Functions for worker processes, which import this file: NumPy only. No tests here."""
 
-import hashlib
 import os
 import sys
 import time
@@ -65,57 +64,3 @@ class FirstTime:
 def of_an_image(x, scene):
     """The sum of a large array, in a tree."""
     return x + scene["image"].sum()
-
-
-class Faulty:
-    """A bowl with a fault at one point in ten, always the same for a point; none at the start.
-
-    Args:
-        folder: where it writes down its calls.
-        kinds: of faults.
-        residuals: whether it returns three residuals, or the sum of their squares.
-    """
-
-    TARGET = (1.0, -0.5)
-
-    def __init__(self, folder, kinds, residuals):
-        self.folder, self.kinds, self.residuals = Path(folder), kinds, residuals
-        self.folder.mkdir(exist_ok=True)
-
-    def __call__(self, x):
-        x = np.asarray(x)
-        kind = self._kind(x)
-        name = f"{x.tobytes().hex()}-{kind or 'value'}"
-        with (self.folder / name).open("a") as file:
-            file.write("x")
-        match kind:
-            case "raise":
-                raise ValueError("no convergence")
-            case "nan":
-                return np.full(3, np.nan) if self.residuals else np.nan
-            case "shape":
-                return np.zeros(7)
-            case "exit" | "unpickled" | "hang" | "die":
-                fault({"die": 2, "hang": 3, "exit": 4, "unpickled": 5}[kind])
-        away = x - np.array(self.TARGET, x.dtype)
-        rows = np.append(away, away.sum())
-        return rows if self.residuals else (rows**2).sum()
-
-    def _kind(self, x):
-        chance = int.from_bytes(hashlib.blake2b(x.tobytes(), digest_size=4).digest(), "big")
-        if chance % 10 or not x.any():
-            return None
-        return self.kinds[chance // 10 % len(self.kinds)]
-
-    def calls(self):
-        """How often each point was called."""
-        files = ((file.name.split("-")[0], file) for file in self.folder.iterdir())
-        return {self._point(code): len(file.read_text()) for code, file in files}
-
-    def faults(self):
-        """The points that had a fault."""
-        names = (file.name.split("-") for file in self.folder.iterdir())
-        return {self._point(code) for code, kind in names if kind != "value"}
-
-    def _point(self, code):
-        return tuple(np.frombuffer(bytes.fromhex(code), np.float32).tolist())
