@@ -167,7 +167,8 @@ def test_rosenbrocks_valley_is_followed_to_its_end(seeds, x64):
         result = solve(
             rosenbrock, (-1.2, 1.0), sigma=0.3, seed=seed, max_evaluations=600, dtype=np.float64
         )
-        assert result.reason in ("converged", "stalled"), seed
+        # at the minimum itself values are all rounding, which differs between programs
+        assert result.reason in ("converged", "stalled") or result.fun < 1e-25, seed
         assert distance(result.y, 1) < 1e-4, seed
 
 
