@@ -311,7 +311,7 @@ def of_slope(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="the default network of GELU learns this slope less well", strict=False)
+@pytest.mark.xfail(reason="0.84 since the new schedules and network; the cause is open")
 def test_the_control_variate_is_what_the_run_has_learnt(monkeypatch, of_slope, tmp_path):
     # a gp knows a slope from its samples; without one, all variance is what the surrogate leaves
     of_slope(400)
