@@ -27,7 +27,7 @@ def warn_if_it_can_hang() -> None:
 
 def _on_cpu() -> bool:
     """Whether JAX will run on a CPU, as far as can be told without starting it."""
-    platforms = jax.config.read("jax_platforms")
+    platforms = jax.config.jax_platforms
     if platforms:
         return platforms.split(",")[0] == "cpu"
     return not any(map(importlib.util.find_spec, _ACCELERATORS))

@@ -1,18 +1,29 @@
 """What every test runs under: strict dtypes and ranks, warnings as errors, x64 off by default."""
 
 import os
+import shutil
 import subprocess
 import sys
+import tempfile
 
 # a small solve that waits for threads of LAPACK on busy cores takes a hundred times as long
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax
 import pytest
+from jaxtyping import install_import_hook
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
+
+# Programs that are the same in several tests are compiled once a run: the second time, they come from
+# a folder of this run alone.
+CACHE = {
+    "jax_compilation_cache_dir": None,
+    "jax_persistent_cache_min_compile_time_secs": 0.0,
+    "jax_persistent_cache_min_entry_size_bytes": -1,
+}
 
 # XLA's older, smaller code for fused operations, in one piece: half the time to compile
 QUICK_FLAGS = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
@@ -21,13 +32,22 @@ QUICK_FLAGS = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_sp
 def pytest_configure(config):
     """The quick part compiles with few optimisations; `pytest -m slow` runs what users run.
 
-    Most of a quick test is compiling, which takes less than half as long.
+    Most of a quick test is compiling, which takes less than half as long. Shapes and types of all
+    arguments are checked in the slow part, as that takes a sixth of the time.
     """
     quick = config.option.markexpr != "slow"
     jax.config.update("jax_disable_most_optimizations", quick)
     first = not hasattr(config, "workerinput")  # workers inherit what the first process has set
-    if quick and first and "XLA_FLAGS" not in os.environ and knows(QUICK_FLAGS):
-        os.environ["XLA_FLAGS"] = QUICK_FLAGS
+    if first:
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = folder = tempfile.mkdtemp()
+        config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+        if quick and "XLA_FLAGS" not in os.environ and knows(QUICK_FLAGS):
+            os.environ["XLA_FLAGS"] = QUICK_FLAGS
+    for name, value in CACHE.items():
+        jax.config.update(name, os.environ["JAX_COMPILATION_CACHE_DIR"] if value is None else value)
+    if not quick:
+        hook = install_import_hook("smoothdiff", "beartype.beartype")
+        config.add_cleanup(hook.uninstall)
 
 
 def knows(flags):

@@ -28,7 +28,7 @@ class jax_platforms:
         self.platforms = platforms
 
     def __enter__(self):
-        self.before = jax.config.read("jax_platforms")
+        self.before = jax.config.jax_platforms
         jax.config.update("jax_platforms", self.platforms)
 
     def __exit__(self, *_):
