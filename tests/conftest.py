@@ -17,8 +17,8 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
-# Programs that are the same in several tests are compiled once a run: the second time, they come from
-# a folder of this run alone.
+# Programs that are the same in several tests are compiled once a run: the second time, they come
+# from a folder of this run alone.
 CACHE = {
     "jax_compilation_cache_dir": None,
     "jax_persistent_cache_min_compile_time_secs": 0.0,
@@ -37,6 +37,8 @@ def pytest_configure(config):
     """
     quick = config.option.markexpr != "slow"
     jax.config.update("jax_disable_most_optimizations", quick)
+    if quick:  # a tenth of the time goes into the lines of code that XLA's programs would name
+        jax.config.update("jax_traceback_in_locations_limit", 0)
     first = not hasattr(config, "workerinput")  # workers inherit what the first process has set
     if first:
         os.environ["JAX_COMPILATION_CACHE_DIR"] = folder = tempfile.mkdtemp()

@@ -280,6 +280,7 @@ def test_the_command_line_writes_results_pictures_and_tables(monkeypatch, tmp_pa
         cli.main(["draw", "shadow"], tmp_path)
 
 
+@pytest.mark.slow
 def test_a_family_shares_a_table_and_a_picture(monkeypatch, tmp_path, capsys):
     def members(full):
         score = Score(REFERENCE, optimum=0.0)
@@ -325,6 +326,7 @@ def test_an_interruption_ends_all_scenes(monkeypatch, tmp_path):
         cli.main(["run", "all", "--methods", "halving"], tmp_path)
 
 
+@pytest.mark.slow
 def test_nothing_is_lost_by_a_kill(monkeypatch, tmp_path):
     script = """
 import sys

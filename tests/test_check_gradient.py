@@ -43,30 +43,33 @@ def stairs_gradient(y):
 
 grad = jax.grad(wave)
 ad = lambda fun: jax.grad(fun)
+# compiled once for all seeds
+WAVE, STAIRS, EDGE, NOISE = map(jax.jit, (wave, stairs, edge, noise))
 sign = lambda y: grad(y).at[2].multiply(-1)
 GRADIENTS = {
-    "wave, by AD": (grad, wave, []),
-    "wave, by hand": (lambda y: A.T @ jnp.cos(A @ y) + y, wave, []),
-    "wave, of another point": (lambda y: grad(y + 0.3), wave, [0, 1, 2, 3]),
-    "wave, a sign": (sign, wave, [2]),
-    "wave, a factor": (lambda y: 2 * grad(y), wave, [0, 1, 2, 3]),
-    "wave, an entry forgotten": (lambda y: grad(y).at[1].set(0), wave, [1]),
-    "wave, two entries swapped": (lambda y: grad(y)[jnp.array([1, 0, 2, 3])], wave, [0, 1]),
-    "wave, a part stopped": (lambda y: A.T @ jnp.cos(A @ y), wave, [0, 1, 2, 3]),
-    "stairs, by AD": (ad(stairs), stairs, [0, 1, 2, 3]),
-    "stairs, smoothed": (stairs_gradient, stairs, []),
-    "edge, by AD": (ad(edge), edge, [0, 2]),
-    "noise, by AD": (grad, noise, []),
-    "noise, a sign": (sign, noise, [2]),
+    "wave, by AD": (grad, WAVE, []),
+    "wave, by hand": (lambda y: A.T @ jnp.cos(A @ y) + y, WAVE, []),
+    "wave, of another point": (lambda y: grad(y + 0.3), WAVE, [0, 1, 2, 3]),
+    "wave, a sign": (sign, WAVE, [2]),
+    "wave, a factor": (lambda y: 2 * grad(y), WAVE, [0, 1, 2, 3]),
+    "wave, an entry forgotten": (lambda y: grad(y).at[1].set(0), WAVE, [1]),
+    "wave, two entries swapped": (lambda y: grad(y)[jnp.array([1, 0, 2, 3])], WAVE, [0, 1]),
+    "wave, a part stopped": (lambda y: A.T @ jnp.cos(A @ y), WAVE, [0, 1, 2, 3]),
+    "stairs, by AD": (ad(stairs), STAIRS, [0, 1, 2, 3]),
+    "stairs, smoothed": (stairs_gradient, STAIRS, []),
+    "edge, by AD": (ad(edge), EDGE, [0, 2]),
+    "noise, by AD": (grad, NOISE, []),
+    "noise, a sign": (sign, NOISE, [2]),
 }
 
 
+COMPILED = {name: jax.jit(gradient) for name, (gradient, _, _) in GRADIENTS.items()}
+
+
 def checked(name, seed, num_samples=1024):
-    gradient, fun, wrong = GRADIENTS[name]
+    _, fun, wrong = GRADIENTS[name]
     key = jax.random.key(seed)
-    found = sd.check_gradient(
-        jax.jit(gradient), jax.jit(fun), Y, SIGMA, key=key, num_samples=num_samples
-    )
+    found = sd.check_gradient(COMPILED[name], fun, Y, SIGMA, key=key, num_samples=num_samples)
     return found, wrong
 
 

@@ -52,6 +52,7 @@ def bowls() -> list[Counted]:
     return [Counted(fun(tilt), cost, (2,)) for tilt, cost in ((0.3, 1.0), (0.1, 4.0), (0.0, 64.0))]
 
 
+@pytest.mark.slow
 def test_the_answer_of_the_finest_level_at_a_fraction_of_its_cost():
     levels = [bars(16), bars(512)]
     start, options = jnp.array([0.45, 0.35]), {"key": KEY, "bounds": (0.0, 1.0)}
@@ -94,6 +95,7 @@ def test_a_number_goes_from_coarse_to_fine():
     assert found.fun < 1e-3
 
 
+@pytest.mark.slow
 def test_levels_that_mislead_are_no_worse_than_the_start():
     far = sd.Level(lambda y, args: y - 40.0, 1.0)
     # a narrow hole at the start, and nothing else to see

@@ -111,6 +111,7 @@ def test_a_good_surrogate_lowers_the_variance(found):
         assert after < 0.2 * before, name
 
 
+@pytest.mark.slow
 def test_each_transform_is_a_part_of_it(x64):
     theta, sigma = jnp.asarray(THETA), jnp.asarray(SIGMA)
     transforms = {
@@ -198,6 +199,7 @@ def plateaus(y, args=None):
     return jnp.sum(jnp.floor(16 * (y - 0.3) ** 2)) / 16
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "steps"),
     [

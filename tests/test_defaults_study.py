@@ -41,6 +41,7 @@ def test_the_best_setting_is_named_beside_the_shortest_call():
     assert grid.rows[0].name == "X"
 
 
+@pytest.mark.slow
 def test_the_shortest_call_counts_as_the_function_does():
     case = defaults.of_simulator("ball")
     run = defaults.trace(case, 0, None)

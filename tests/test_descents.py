@@ -66,6 +66,7 @@ def bowl(name="bowl", high=np.inf):
     )
 
 
+@pytest.mark.slow
 def test_results_say_what_was_tuned_reached_and_drawn(tmp_path, monkeypatch):
     built: list[Task] = [bowl("one"), replace(bowl("other"), pictures=None)]
     entry = TaskEntry("Bowls", "descent", lambda full: built)

@@ -244,6 +244,7 @@ def test_cycles_end():
 WAYS = ["0", "7"]
 
 
+@pytest.mark.slow
 def test_another_process_gives_the_same_digests():
     """With other seeds of its hashes, of which sets and addresses depend."""
     script = (

@@ -15,7 +15,8 @@ TRANSFORMS = sorted(name for name in sd.__all__ if name.startswith("smooth"))
 # modules of optional extras import what the test extra brings
 EXAMPLES = ["smoothdiff", *MODULES]
 # whole runs that take long to compile; `minimise` and `least_squares` have quicker ones
-LONG = [name for name in MODULES if name.startswith("smoothdiff._solvers.")]
+WHOLE_RUNS = ("_solvers.", "_minimise", "_search", "_coarse", "_grey_box", "_with_cov", "plot")
+LONG = [name for name in MODULES if name.removeprefix("smoothdiff.").startswith(WHOLE_RUNS)]
 
 
 @pytest.mark.parametrize("name", sd.__all__)

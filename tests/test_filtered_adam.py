@@ -271,6 +271,7 @@ np.testing.assert_allclose(*found, rtol=1e-4, atol=1e-6)
 """
 
 
+@pytest.mark.slow
 def test_sharded_arrays():
     flags = "--xla_force_host_platform_device_count=2"
     environment = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
@@ -280,6 +281,7 @@ def test_sharded_arrays():
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_it_descends_on_sampled_gradients_of_a_function_with_steps():
     # a picture of two flat halves, seen in sixteen levels of grey, from 32 renders a step
     target = jnp.where(jnp.arange(12)[None, :] < 6, 0.2, 0.8) * jnp.ones((12, 1))

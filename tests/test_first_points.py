@@ -83,6 +83,7 @@ def test_a_round_beyond_the_domain_is_drawn_nearer(x64):
     assert float(result.fun) < 0.1 * (0.1**2 + 0.05**2) / 2
 
 
+@pytest.mark.slow
 def test_a_function_without_numbers_is_an_error():
     solver = sd.GaussNewton(1.0, nonfinite="drop")
     with pytest.raises(sd.MinimiseError, match="NaN or infinite"):

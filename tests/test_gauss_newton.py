@@ -243,6 +243,7 @@ def test_one_plateau_everywhere_widens_sigma_until_it_is_left():
     assert result.fun == 0
 
 
+@pytest.mark.slow
 def test_runs_of_optimistix_on_pytrees_inside_jit_are_those_on_vectors(x64):
     fun, y0, args = problem(line, (0.0, 0.0), dtype=np.float64)
     bounds, steps = (-0.45, 5.0), 6
@@ -406,6 +407,7 @@ def test_a_restart_begins_elsewhere_within_the_bounds_with_the_first_sigma():
     assert run.reason == "stalled"
 
 
+@pytest.mark.slow
 def test_a_run_resumed_in_a_later_search_ends_with_the_same_bits(tmp_path):
     run = partial(solve, table, (8, 25), sigma=3.0, bounds=(0, 39), watched=True)
     run = partial(run, **SEARCHES | {"patience": 15})
@@ -421,6 +423,7 @@ def test_a_run_resumed_in_a_later_search_ends_with_the_same_bits(tmp_path):
     assert (resumed.fun, resumed.evaluations) == (whole.fun, whole.evaluations)
 
 
+@pytest.mark.slow
 def test_a_search_that_converged_is_followed_by_the_next():
     settings = SEARCHES | {"restarts": 2, "patience": 100}
     run = solve(decay, (1, 1), bounds=(-100, 100), max_steps=500, watched=True, **settings)
@@ -429,6 +432,7 @@ def test_a_search_that_converged_is_followed_by_the_next():
     assert len(begun(0.3)) == 1 + 2
 
 
+@pytest.mark.slow
 def test_restarts_find_the_deeper_of_two_valleys():
     # the bars begin where they have all but changed places
     y0, target = (28, 11), (10, 29)

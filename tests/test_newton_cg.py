@@ -279,6 +279,7 @@ def test_an_ellipsoid_of_condition_1e6_in_any_direction(x64):
 LOW, HIGH = np.array([-1.0, -2.0], np.float32), np.array([0.5, 2.0], np.float32)
 
 
+@pytest.mark.slow
 def test_bounds_hold_at_every_evaluation():
     bounds = (LOW, HIGH)
     result = solve(
@@ -300,6 +301,7 @@ def test_an_optimum_on_a_bound_is_found(corner):
     assert distance(result.y, best) < 0.01
 
 
+@pytest.mark.slow
 def test_restarts_begin_anywhere_within_the_bounds():
     settings = {"target": (0.7, 0.3), "bounds": (-50, 50), "seed": 5, "rtol": 1e-3}
     one = solve(watched, (1, 2), max_evaluations=1000, **settings)
@@ -319,6 +321,7 @@ def test_restarts_begin_anywhere_within_the_bounds():
     np.testing.assert_allclose(run.y, [0.7, 0.3], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_restarts_find_the_deeper_well():
     firsts = []
     for seed in range(2):
@@ -348,6 +351,7 @@ def test_iterates_are_those_of_optimistix_but_for_rounding(x64):
     assert result.evaluations == 30 + 2
 
 
+@pytest.mark.slow
 def test_runs_vmapped_on_vectors_are_single_ones_on_pytrees(x64):
     solver, target = sd.NewtonCG(jnp.asarray(1.0)), (0.5, 0.3)
 
@@ -411,6 +415,7 @@ SCHEDULE = optax.exponential_decay(0.5, 1, 0.8)
 DROPPING: dict[str, Any] = {"sigma": SCHEDULE, "nonfinite": "drop", "num_samples": 16}
 
 
+@pytest.mark.slow
 def test_a_schedule_for_sigma_is_followed():
     result = solve(quadratic, (0.0, 0.0), (0.5, 0.3), max_steps=12, **DROPPING)
     expected = [float(np.asarray(SCHEDULE(i))) for i in range(12)]

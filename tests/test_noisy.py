@@ -123,6 +123,7 @@ def test_so_it_is_with_every_solver_of_batches(minimise, fun, solver, host):
     assert len(set.union(*groups, last)) == 8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("residuals", [False, True])
 def test_the_local_model_shares_its_numbers_and_rounds_have_others(residuals, host):
     fun, minimise = (rows, sd.least_squares) if residuals else (value, sd.minimise)
@@ -234,12 +235,14 @@ def test_fresh_numbers_find_more_than_fixed_ones(minimise, fun, gap, solver, arg
     assert find(True) < 0.2 * find(False)
 
 
+@pytest.mark.slow
 def test_a_function_that_ignores_the_key_has_no_noise():
     flat = lambda y, args, key: jnp.sum((y - args) ** 2)
     result = sd.minimise(flat, START, CENTER, key=KEY, max_evaluations=60, takes_key=True)
     np.testing.assert_allclose(result.y, CENTER, atol=1e-2)
 
 
+@pytest.mark.slow
 def test_errors_of_the_parameters_come_from_evaluations_with_one_key():
     data = DATA + 0.05 * jax.random.normal(jax.random.key(1), DATA.shape)
     fun = lambda y, args, key: decay(y, args, key)

@@ -147,6 +147,7 @@ def test_what_leads_nowhere_is_no_success():
         optx.least_squares(flat, sd.GaussNewton(0.3), START, options={"key": KEY})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_samples", [pytest.param(None, marks=pytest.mark.slow), 3])
 def test_aux_is_that_of_the_iterate(num_samples):
     """So the best so far, which goes by aux, is the best of what was evaluated."""

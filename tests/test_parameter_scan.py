@@ -86,6 +86,7 @@ def solved(seed, bounds, max_evaluations):
     )
 
 
+@pytest.mark.slow
 def test_open_sides_are_not_scanned():
     assert np.isfinite(solved(0, (-jnp.inf, HIGH), 300).fun)
 

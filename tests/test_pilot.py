@@ -56,6 +56,7 @@ def test_the_nearest_change_says_how_far_the_first_points_are(changed, good, len
     assert (int(pilot.tried), float(pilot.length)) == (2, length)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "run", [pytest.param(sd.minimise, marks=pytest.mark.slow), sd.least_squares]
 )
@@ -83,6 +84,7 @@ def test_a_sigma_that_is_far_too_small_is_no_trouble(n, sigma):
     assert np.sum(np.array(found) == 0) >= 5
 
 
+@pytest.mark.slow
 def test_a_function_that_fails_further_away_is_searched_nearby():
     """Without nonfinite="drop": nobody asked for points so far away."""
     fun = lambda y, _: jnp.where(jnp.max(jnp.abs(y)) < 10, plateaus(y, None), jnp.nan)

@@ -78,6 +78,7 @@ def test_residuals_with_a_dead_parameter_and_the_names_of_spaces():
     }
 
 
+@pytest.mark.slow
 def test_a_plateau_gets_a_larger_sigma():
     fun = lambda y, _: jnp.floor(jnp.linalg.norm(y - 5.3))
     advice = recommend(fun, jnp.zeros(2), key=KEY, sigma=0.02)

@@ -248,6 +248,7 @@ def test_float64_residuals_of_float32_parameters_are_no_noise(x64):
     assert result.fun == pytest.approx(float(jnp.sum(fun(result.y, None) ** 2)) / 2, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_search_that_ends_far_away_on_a_plateau_is_judged():
     # so far away that sigma is less than the spacing of numbers there
     solver = sd.GaussNewton(0.06, restarts=1)

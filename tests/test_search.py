@@ -95,6 +95,7 @@ def test_earlier_evaluations_teach():
     assert np.isfinite(search.ask(3)).all()
 
 
+@pytest.mark.slow
 def test_a_space_is_asked_for_natural_values():
     space = {"rate": sd.Range(1e-4, 1e2, log=True), "teeth": sd.Integer(3, 20)}
     y0 = {"rate": np.float32(0.01), "teeth": 7}

@@ -98,6 +98,7 @@ def test_sigma_is_a_share_of_the_range_or_of_the_start(y0, bounds, sigma):
         np.testing.assert_allclose(one, other, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_ten_starts_on_stairs_need_no_setting():
     found = [float(sd.minimise(stairs, jnp.zeros(3), key=jax.random.key(k)).fun) for k in range(5)]
     assert np.median(found) <= 1
@@ -119,6 +120,7 @@ def test_seconds_end_the_run():
     assert not result.history
 
 
+@pytest.mark.slow
 def test_a_plateau_is_no_convergence(x64):
     result = sd.minimise(lambda y, _: 0 * jnp.sum(y), jnp.ones(3), key=KEY)
     assert result.reason in ("noise", "stalled")
@@ -155,6 +157,7 @@ def test_limits_that_are_none_are_refused(limit, match):
 # under optimistix
 
 
+@pytest.mark.slow
 def test_the_host_takes_the_steps_of_optimistix(x64):
     """But for rounding: the parts of a step are compiled each by itself."""
     for solver, run, twin, fun in [

@@ -228,6 +228,7 @@ print(jax.vmap(box)(xs).tolist(), calls)
 """
 
 
+@pytest.mark.slow
 def test_a_run_that_is_killed_is_paid_for_once(path):
     run = lambda at: subprocess.run(
         [sys.executable, "-c", KILLED, str(path), str(at)], capture_output=True, text=True
@@ -256,6 +257,7 @@ for x in range(100):
 """
 
 
+@pytest.mark.slow
 def test_several_processes_write_at_once(path):
     start = lambda: subprocess.Popen(
         [sys.executable, "-W", "error", "-c", SHARED, str(path)], stderr=subprocess.PIPE, text=True
@@ -324,6 +326,7 @@ def test_a_large_array_that_all_points_share_is_there_once(path):
     assert [args[1].shape for args, _ in sd.load_store(path)] == [(256, 256)] * 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver",
     [pytest.param(sd.NewtonCG(0.2), marks=pytest.mark.slow), None],
@@ -342,6 +345,7 @@ def test_a_run_that_is_made_again_costs_nothing_and_gives_the_same_bits(solver, 
     assert (first.fun, first.evaluations) == (second.fun, second.evaluations)
 
 
+@pytest.mark.slow
 def test_a_search_begins_with_what_is_there(path):
     f = sd.black_box(lambda y: np.sum(np.abs(y - 1)), 0.0, store=path)
     y0, key = jnp.zeros(2), jax.random.key(0)

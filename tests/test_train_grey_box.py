@@ -91,6 +91,7 @@ def test_each_part_can_be_left_out(parts):
     assert loss(result.model) < 0.1 * loss(Linear(jnp.zeros((2, 4))))
 
 
+@pytest.mark.slow
 def test_cases_learn_from_each_other_and_not_from_renders_that_failed():
     """One case has a step at a time, and the others see what was rendered for it."""
     RENDERED.clear()
