@@ -3,8 +3,9 @@
 The paper descends on the surrogate, which is biased; taken off the function before it is sampled
 and put back afterwards, the same surrogate leaves the estimate unbiased. Along a run of ours, the
 gradient at the parameters of the time is estimated many times, with and without the surrogate of
-the time, from equally many evaluations. Those of the run, which the surrogate has learnt from, come
-on top. Both with the mean as a baseline and with the default, which is itself a fit to the samples.
+the time, at the sigma of the time, from equally many evaluations. Those of the run, which the
+surrogate has learnt from, come on top. Both with the mean as a baseline and with the default, which
+is itself a fit to the samples.
 """
 
 from collections.abc import Callable, Iterator
@@ -66,9 +67,12 @@ def _ratio(problem: Problem, solver: sd.ZeroGrads, baseline: str) -> Callable[..
             each = jax.lax.map(lambda key: gradient(key, y), jax.random.split(key, REPEATS))
             return jnp.sum(jnp.var(each, axis=0))
 
-        args = problem.loss, solver.learnt(state, y), problem.sigma
-        helped = sd.control_variate(sd.smooth_grad, *args, **options)
-        return variance(sd.smooth_grad(problem.loss, problem.sigma, **options)) / variance(helped)
+        # what is learnt is the function as it was sampled, at the sigma of that step
+        sigma = state.progress.sigma
+        helped = sd.control_variate(
+            sd.smooth_grad, problem.loss, solver.learnt(state, y), sigma, **options
+        )
+        return variance(sd.smooth_grad(problem.loss, sigma, **options)) / variance(helped)
 
     return ratio
 
