@@ -93,6 +93,6 @@ def test_open_sides_are_not_scanned():
 
 @pytest.mark.slow
 def test_a_solver_with_restarts_finds_the_global_minimum():
-    found = np.array([solved(seed, (LOW, HIGH), 900).fun for seed in range(8)])
+    found = np.array([solved(seed, (LOW, HIGH), 900).fun for seed in range(4)])
     # a first scan may miss a basin that is a tenth of the line
-    assert np.sum(found < 1e-3) >= 6
+    assert np.sum(found < 1e-3) >= 3

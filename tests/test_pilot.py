@@ -72,16 +72,16 @@ def test_a_sigma_that_is_far_too_small_costs_few_evaluations(run):
 @pytest.mark.parametrize("n", [2, 5])
 @pytest.mark.parametrize("sigma", [0.1, 0.01])
 def test_a_sigma_that_is_far_too_small_is_no_trouble(n, sigma):
-    """From 6 starts, at a distance of 3.5 in any direction."""
+    """From 4 starts, at a distance of 3.5 in any direction."""
     found = []
-    for seed in range(6):
+    for seed in range(4):
         key = jax.random.key(seed)
         y0 = jax.random.normal(key, (n,))
         y0 = target(n) + 3.5 * y0 / jnp.linalg.norm(y0)
         result = sd.minimise(plateaus, y0, key=key, sigma=sigma)
         found.append(result.fun)
         assert result.evaluations < 40 * (n + 1) + 160
-    assert np.sum(np.array(found) == 0) >= 5
+    assert np.sum(np.array(found) == 0) >= 3
 
 
 @pytest.mark.slow
