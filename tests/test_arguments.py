@@ -147,6 +147,7 @@ def test_aux_has_one_row_for_each_sample(baseline, rows, key):
         assert_same(aux["twice"], 2 * jnp.sum(aux["x"], axis=1))
 
 
+@pytest.mark.slow
 def test_leaves_with_sigma_none_are_differentiated_by_ad(key):
     """f = y^2 step(x) + y^3 with x smoothed and y left to AD."""
     fun = lambda p: p["y"] ** 2 * step(p["x"]) + p["y"] ** 3

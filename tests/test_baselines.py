@@ -153,6 +153,7 @@ def test_outputs_do_not_see_each_other(key, x64):
         assert_same(found[name], want, np.float64, name=name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sampler", "num_samples", "baseline"),
     [

@@ -206,6 +206,7 @@ def test_chunks_change_only_the_rounding(sampler, num_samples, batch_size, key):
     assert_same(*with_and_without_chunks(run, sampler, num_samples, batch_size))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sampler", "num_samples", "batch_size"), sizes("weighted", "parts of replicates")
 )

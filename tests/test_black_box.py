@@ -893,6 +893,7 @@ def test_arguments_that_never_arrive_raise_instead_of_hanging(monkeypatch):
         jax.block_until_ready(jax.jit(f)(jnp.ones(3)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", ["1", "2"])
 def test_large_arguments_need_two_threads_of_jax(threads):
     """The sum with two; with one it depends on who comes first, and there is an error, no hang.

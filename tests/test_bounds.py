@@ -27,6 +27,7 @@ def test_the_function_sees_clamped_points_and_the_weights_do_not():
     assert_unbiased((value, grad), exact, resolution=0.005)
 
 
+@pytest.mark.slow
 def test_smoothing_of_the_clamped_function(key):
     """Value, gradient, Hessian of E clip(x) between two bounds, in one leaf of a pytree."""
 

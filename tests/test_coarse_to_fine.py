@@ -85,6 +85,7 @@ def test_one_level_is_the_minimiser_itself():
     assert found.cost == alone.evaluations == found.evaluations[0]
 
 
+@pytest.mark.slow
 def test_a_number_goes_from_coarse_to_fine():
     def rippled(ripple):
         return lambda y, args: jnp.sum(y**2) + ripple * jnp.sum(jnp.sin(40 * y) ** 2)

@@ -112,6 +112,7 @@ def test_an_angle_has_its_error_at_the_end_of_its_period(x64):
 # where there are none
 
 
+@pytest.mark.slow
 def test_a_parameter_at_a_bound_is_fixed_for_the_others(x64):
     result = fitted(line, noisy(line, TRUTH, 0.3), bounds=(-10.0, {"a": 10.0, "b": 1.0}))
     assert result.y["b"] == 1
@@ -122,6 +123,7 @@ def test_a_parameter_at_a_bound_is_fixed_for_the_others(x64):
     np.testing.assert_allclose(errors["a"], np.sqrt(variance), rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "unknown"),
     [
@@ -148,6 +150,7 @@ def test_as_many_parameters_as_residuals_have_none():
         assert np.all(np.isnan(result.covariance))
 
 
+@pytest.mark.slow
 def test_other_solvers_have_none():
     result = sd.minimise(lambda y, _: jnp.sum(y**2), jnp.ones(2), key=KEY, max_steps=1)
     assert (result.covariance, result.parameter_errors) == (None, None)

@@ -56,6 +56,7 @@ def test_without_filters_it_is_adam(b1, b2, dtype):
     assert jax.tree.leaves(found)[0].dtype == dtype
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("second_moment", ["filter", "max", "none"])
 @pytest.mark.parametrize(("b1", "b2"), [(0.2, 0.36), (0.0, 0.36), (0.2, 0.0), (0.0, 0.0)])
 def test_it_is_algorithm_2(b1, b2, second_moment, x64):

@@ -82,6 +82,7 @@ def test_gradient_descent_follows_the_smoothed_gradient():
     assert state.progress.smoothed == pytest.approx(2 * 0.8**8, rel=0.1)
 
 
+@pytest.mark.slow
 def test_pytrees_with_a_sigma_for_each_leaf_and_ad_where_there_is_none_within_bounds():
     seen = []
     host = lambda y: seen.append(np.array(y)) or np.sum((np.round(8 * y) / 8 - [2, -0.5, 0]) ** 2)

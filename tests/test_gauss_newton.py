@@ -392,6 +392,7 @@ def begun(sigma):
     return np.flatnonzero(np.all(np.abs(np.abs(away) - sigma * np.eye(2)) < 1e-4, axis=(1, 2)))
 
 
+@pytest.mark.slow
 def test_a_restart_begins_elsewhere_within_the_bounds_with_the_first_sigma():
     bounds = (0, 39)
     run = solve(table, (8, 25), sigma=3.0, bounds=bounds, watched=True, max_steps=150, **SEARCHES)
@@ -513,6 +514,7 @@ def test_an_unknown_linear_map_is_learnt(parameters):
 SOUGHT = np.random.default_rng(0).normal(size=MANY_SIZE)
 
 
+@pytest.mark.slow
 def test_which_residuals_a_parameter_moves_is_found():
     """Most of the thousand do nothing; a step sees 36 samples."""
     result = solve(own, np.zeros(N), SOUGHT, sigma=0.5, max_steps=12, **FEW)

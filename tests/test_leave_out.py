@@ -10,6 +10,7 @@ from closed_forms import assert_same, assert_unbiased, boxes, keys, quadratic_mo
 from scipy import stats
 
 import smoothdiff as sd
+from tests.parts import quick_of
 
 KEY = jax.random.key(0)
 PAIRS = sd.Gaussian(antithetic=True)
@@ -138,12 +139,18 @@ GROUPED = {
 }
 
 
-@pytest.mark.parametrize(
-    ("name", "drop"),
-    [(name, False) for name in GROUPED] + [("single", True), ("threes", True), ("one set", True)],
-)
-def test_leaving_out_is_refitting(name, drop, x64):
+CASES = [(name, False) for name in GROUPED] + [
+    ("single", True),
+    ("threes", True),
+    ("one set", True),
+]
+QUICK = [("pairs", False), ("one set", False), ("threes", True)]
+
+
+@pytest.mark.parametrize("case", quick_of(CASES, QUICK), ids=str)
+def test_leaving_out_is_refitting(case, x64):
     """48 samples (threes: 47) of a function with an offset, in two dimensions; 15 % are bad."""
+    name, drop = case
     sampler, group = GROUPED[name]
     num = 47 if name == "threes" else 48
     theta, sigma = jnp.array([0.1, 0.2]), jnp.array([0.5, 0.4])
@@ -178,6 +185,7 @@ def test_leaving_out_is_refitting(name, drop, x64):
         np.testing.assert_allclose(hessian * np.outer(sigma, sigma), want[2], atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("baseline", ["linear", "gp", "mean"])
 def test_where_there_are_no_others_nothing_is_subtracted(baseline, x64):
     """One pair alone, or one that is left when others are dropped: as without a baseline."""
@@ -240,7 +248,7 @@ COVERAGE = {
 }
 
 
-@pytest.mark.parametrize("name", COVERAGE)
+@pytest.mark.parametrize("name", quick_of(COVERAGE, ["replicates", "one set"]))
 def test_standard_errors_cover(name):
     """Nominal 95 % t-intervals of value, gradient and a Hessian-vector product over 1,000 keys.
 

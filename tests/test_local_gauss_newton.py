@@ -172,6 +172,7 @@ def test_many_parameters_in_few_evaluations():
     assert squares(result.y) < 1e-3 * squares(np.float32(0))
 
 
+@pytest.mark.slow
 def test_it_says_when_it_has_converged(x64):
     result = fit(off, dtype=np.float64, atol=0.01, max_evaluations=4000)
     assert result.reason == "converged"
@@ -278,6 +279,7 @@ def test_a_plateau_is_left():
 # faults and bad input
 
 
+@pytest.mark.slow
 def test_samples_that_fail():
     y0 = np.float32(HIDDEN[7])
     result = fit(holes, y0, num_samples=42, nonfinite="drop")

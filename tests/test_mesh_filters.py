@@ -12,6 +12,7 @@ from benchmarks.scenes.meshes import cube, icosphere
 from smoothdiff.filters import mesh
 from smoothdiff.filters._triangles import edges
 from smoothdiff.filters.mesh import mesh_bilateral, mesh_laplacian
+from tests.parts import quick_of
 
 LAM = 19.0  # the paper's
 SIGMAS: Any = {"sigma_d": 0.5, "sigma_phi": 0.4}
@@ -41,7 +42,7 @@ MESHES = {
 }
 
 
-@pytest.fixture(params=list(MESHES))
+@pytest.fixture(params=quick_of(MESHES, ["cube", "apart"]))
 def body(request):
     positions, faces = MESHES[request.param]
     rng = np.random.default_rng(3)

@@ -162,6 +162,7 @@ def test_history_says_what_happened():
     assert records[0].y["a"] == pytest.approx(0.45, abs=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", [ADAM, sd.NewtonCG(0.2)])
 def test_records_have_the_lowest_value_of_all_that_was_evaluated(solver, host):
     run = sd.minimise(host_plateaus, Y0, NO_EDGE, key=KEY, solver=solver, max_steps=6)
@@ -171,6 +172,7 @@ def test_records_have_the_lowest_value_of_all_that_was_evaluated(solver, host):
     assert run.fun <= run.history[-1].fun
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("n", "asked", "kept"), [(2, None, True), (2, False, False), (20_000, None, False)]
 )

@@ -176,6 +176,7 @@ def test_a_run_that_is_taken_up_again_ends_with_the_same_bits(host, tmp_path):
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("minimise", "twin", "fun", "solver", "args"),
     [

@@ -129,7 +129,7 @@ def test_what_does_not_step_as_ours_do_is_refused(minimise, solver, match):
     ("run", "fun", "solver"),
     [
         pytest.param(optx.minimise, bowl, sd.NewtonCG(0.3), marks=pytest.mark.slow),
-        (optx.minimise, squares, sd.NewtonCG(0.3)),
+        pytest.param(optx.minimise, squares, sd.NewtonCG(0.3), marks=pytest.mark.slow),
         (optx.least_squares, valley, sd.GaussNewton(0.3)),
     ],
 )

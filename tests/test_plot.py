@@ -105,6 +105,7 @@ def test_history_is_logarithmic_where_that_helps(ax, values, scale):
     ax.figure.canvas.draw()
 
 
+@pytest.mark.slow
 def test_history_of_a_run(pyplot):
     fun = lambda y, args: jnp.sum((y - 0.3) ** 2) + 0.001
     found = sd.minimise(

@@ -62,6 +62,7 @@ def test_probing_finds_a_known_structure():
     assert g(KEY, jnp.zeros(n)).shape == (n,)
 
 
+@pytest.mark.slow
 def test_confidence_is_how_often_an_influence_is_kept():
     """Where an influence is as rare as `response` allows, it is missed as often as stated."""
     # a step moves with probability one half exactly

@@ -96,6 +96,7 @@ def test_fischers_slope_sees_all_parameters_at_once(key):
     assert np.mean(found, 0) == pytest.approx([3, -2], rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_an_iteration_takes_the_evaluations_of_table_3_each_pair_counted_twice(name):
     task, counter, counts = TASKS["quad"](), Counter(), []

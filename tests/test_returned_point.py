@@ -15,6 +15,7 @@ import smoothdiff as sd
 from smoothdiff._seen import Seen
 from smoothdiff._solvers._base import Progress
 from smoothdiff._solvers._judgement import Values, judged, judging
+from tests.parts import quick_of
 
 KEY = jax.random.key(2)
 TARGET = np.array([0.6, -0.4], np.float32)
@@ -111,7 +112,7 @@ class Run:
             return error.result
 
 
-@pytest.fixture(scope="module", params=SETTINGS)
+@pytest.fixture(scope="module", params=quick_of(SETTINGS, ["chunks", "newton", "gauss-newton"]))
 def run(request):
     return Run(SETTINGS[request.param]())
 

@@ -33,7 +33,11 @@ def evaluated(run, fun, shape, **settings):
 
 
 @pytest.mark.parametrize(
-    ("run", "fun", "shape"), [(sd.least_squares, valley, (2,)), (sd.minimise, squares, ())]
+    ("run", "fun", "shape"),
+    [
+        (sd.least_squares, valley, (2,)),
+        pytest.param(sd.minimise, squares, (), marks=pytest.mark.slow),
+    ],
 )
 def test_one_at_a_time_these_are_the_steps_of_the_solvers(run, fun, shape):
     expected = evaluated(run, fun, shape, sigma=0.3, max_steps=30)
@@ -112,6 +116,7 @@ def test_a_space_is_asked_for_natural_values():
     assert int(search.y["teeth"]) == 12
 
 
+@pytest.mark.slow
 def test_bounds_hold():
     bounds = np.array([-1.5, 0.5], np.float32), np.array([0.5, 2.0], np.float32)
     search = sd.Search(START, key=KEY, bounds=bounds)

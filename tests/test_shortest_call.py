@@ -36,6 +36,7 @@ def stairs(y, args):
 # what is chosen
 
 
+@pytest.mark.slow
 def test_few_parameters_get_newton_cg_and_residuals_gauss_newton(x64):
     result = sd.minimise(bowl, jnp.ones(3), key=KEY)
     assert isinstance(result.solver, sd.NewtonCG)

@@ -316,6 +316,7 @@ def test_a_checkpoint_knows_its_space(tmp_path):
             kept(other).load({"a": jnp.ones(2)})
 
 
+@pytest.mark.slow
 def test_solvers_can_search_in_unit_coordinates():
     """What the host loop does with a space."""
     y0 = {"n": 2, "gain": 1e-3}

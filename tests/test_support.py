@@ -55,7 +55,7 @@ SUPPORT = sd.local_support(1, ndim=1)
 @pytest.mark.parametrize(
     ("sampler", "num_samples", "baseline"),
     [
-        (sd.Gaussian(), 16, "mean"),
+        pytest.param(sd.Gaussian(), 16, "mean", marks=pytest.mark.slow),
         (sd.Gaussian(), 16, "none"),
         (sd.Gaussian(antithetic=True), 17, "center"),
         (sd.Sobol(replicates=2), 16, "mean"),

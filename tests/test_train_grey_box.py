@@ -82,6 +82,7 @@ def test_a_network_is_trained_without_labels():
     assert records[-1].fun < 0.1 * records[0].fun
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parts", [{"kept": 0}, {"new_parameters": False}])
 def test_each_part_can_be_left_out(parts):
     RENDERED.clear()

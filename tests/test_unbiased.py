@@ -78,7 +78,7 @@ PRECISION = {
     64: (1024, 0.06),
 }
 # 24 are enough for a full quadratic fit of pairs; two are one group of pairs, of frames
-QUICK = [(name, 24) for name in SAMPLERS]
+QUICK = [(name, 24) for name in list(SAMPLERS)[::3]]
 QUICK += [(name, 2) for name in ("gaussian", "frames of pairs", "replicates", "aggregate 2, quasi")]
 FITTED = [
     case if case in QUICK else pytest.param(*case, marks=pytest.mark.slow)

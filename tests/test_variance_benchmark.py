@@ -116,6 +116,7 @@ def test_costs_to_a_level():
     assert descent.costs(curves, 4, 0.1).tolist() == [12.0, np.inf]
 
 
+@pytest.mark.slow
 def test_results_are_drawn_and_shown(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "200")
     written = _study.write(results(), tmp_path)

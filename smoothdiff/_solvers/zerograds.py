@@ -152,7 +152,8 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
         check_settings(self)
         for name in ("surrogate_optimizer", "optimizer"):
             optim = getattr(self, name)
-            if not isinstance(optim, optax.GradientTransformation | None):
+            left_out = optim is None and name == "optimizer"
+            if not left_out and not isinstance(optim, optax.GradientTransformation):
                 good = "an optax transformation such as optax.adam(1e-3)"
                 raise TypeError(f"{name} must be {good}: {optim}")
         for name in ("surrogate_steps", "parameter_steps"):
