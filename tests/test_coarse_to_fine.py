@@ -64,6 +64,7 @@ def test_the_answer_of_the_finest_level_at_a_fraction_of_its_cost():
     assert found.cost < 0.7 * alone.evaluations
 
 
+@pytest.mark.slow
 def test_all_evaluations_are_counted_and_paid_for():
     counted = bowls()
     levels = [each.level for each in counted]

@@ -105,6 +105,7 @@ def test_it_is_unbiased_whatever_the_surrogate_is(found, dtype):
             assert many.dtype == dtype
 
 
+@pytest.mark.slow
 def test_a_good_surrogate_lowers_the_variance(found):
     _, alone, helped, _ = found(np.dtype("float32"))
     for name, *both in zip(NAMES, alone, helped, strict=True):

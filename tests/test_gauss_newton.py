@@ -521,6 +521,7 @@ def test_which_residuals_a_parameter_moves_is_found():
     assert squares(own, result.y, SOUGHT) < 0.01 * squares(own, np.zeros(N), SOUGHT)
 
 
+@pytest.mark.slow
 def test_a_few_directions_of_many_parameters_are_enough():
     result = solve(mixed, np.zeros(N), sigma=1.0, max_steps=8, **FEW)
     assert squares(mixed, result.y) < 1e-3 * squares(mixed, np.zeros(N))

@@ -166,6 +166,7 @@ def test_what_is_the_same_in_all_samples_is_an_exact_zero(dtype):
 # runs
 
 
+@pytest.mark.slow
 def test_many_parameters_in_few_evaluations():
     result = fit(off)
     assert result.y.dtype == np.float32

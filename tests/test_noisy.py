@@ -143,6 +143,7 @@ def test_the_local_model_shares_its_numbers_and_rounds_have_others(residuals, ho
     np.testing.assert_array_equal(host.points[-6:-4], host.points[-4:-2])
 
 
+@pytest.mark.slow
 def test_a_search_is_told_what_a_run_evaluates(host):
     run = sd.least_squares(rows, START, key=KEY, sigma=0.3, max_steps=40, takes_key=True)
     points, keys = host.points[:40], host.keys[:40]
@@ -157,6 +158,7 @@ def test_a_search_is_told_what_a_run_evaluates(host):
     assert not search.done
 
 
+@pytest.mark.slow
 def test_a_run_that_is_taken_up_again_ends_with_the_same_bits(host, tmp_path):
     go = lambda steps, **loop: sd.minimise(
         value, START, key=KEY, solver=sd.NewtonCG(0.3), max_steps=steps, takes_key=True, **loop

@@ -89,6 +89,7 @@ def test_a_solver_of_the_users_own_steps_and_judges_as_it_says(tmp_path):
     np.testing.assert_array_equal(run(9, checkpoint=tmp_path / "run.npz").y, whole.y)
 
 
+@pytest.mark.slow
 def test_around_a_search_point_by_point_the_budget_and_the_reason_are_ours():
     solver = optx.BestSoFarLeastSquares(sd.GaussNewton(0.3))
     box = sd.black_box(lambda y: np.array([10 * (y[1] - y[0] ** 2), 1 - y[0]]))

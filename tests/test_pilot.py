@@ -95,6 +95,7 @@ def test_a_function_that_fails_further_away_is_searched_nearby():
     assert result.evaluations > 9
 
 
+@pytest.mark.slow
 def test_what_is_the_same_everywhere_is_left_alone_in_the_end():
     result = sd.minimise(lambda y, _: 0 * jnp.sum(y), jnp.zeros(2), key=KEY, sigma=0.1)
     assert result.reason in ("stalled", "noise")

@@ -293,6 +293,7 @@ def test_errors_with_labels_in_a_new_figure(pyplot):
     assert len(pyplot.get_fignums()) == 1
 
 
+@pytest.mark.slow
 def test_errors_of_a_result(ax):
     data = jnp.arange(20.0) + jax.random.normal(jax.random.key(1), (20,))
     fun = lambda y, data: y["slope"] * jnp.arange(20.0) + y["offset"] - data

@@ -21,6 +21,7 @@ def matrix_of(support, n):
     return np.asarray(jax.jacfwd(support)(jnp.zeros(n)))
 
 
+@pytest.mark.slow
 def test_probing_finds_a_known_structure():
     """Over 8 keys: at most the promised share is missed, and most of the rest is ruled out."""
     rng = np.random.default_rng(1)

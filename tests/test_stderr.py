@@ -55,6 +55,7 @@ def coverage(found, error, exact, groups):
     return np.mean(np.abs(np.asarray(found) - np.asarray(exact)) <= width, axis=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("antithetic", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_coverage_at_256_samples(antithetic):
     """Value and gradient: 93 to 97 %, measured 93.2 to 95.8 %.

@@ -106,6 +106,7 @@ def test_cases_learn_from_each_other_and_not_from_renders_that_failed():
     assert np.isfinite(alone.losses).sum() == 8
 
 
+@pytest.mark.slow
 def test_float64(x64):
     result = train(dtype=np.float64, max_evaluations=16 * 2 * EACH * 2)
     assert result.model.weight.dtype == np.float64

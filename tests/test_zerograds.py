@@ -359,6 +359,7 @@ def start(dtype):
     return {"a": np.zeros(2, dtype), "b": [np.zeros(1, dtype)]}
 
 
+@pytest.mark.slow
 def test_bounds_hold_for_the_iterates_and_for_what_the_function_sees():
     SEEN.clear()
     result = sd.minimise(
