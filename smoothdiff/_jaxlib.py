@@ -27,7 +27,7 @@ def warn_if_it_can_hang() -> None:
 
 def _on_cpu() -> bool:
     """Whether JAX will run on a CPU, as far as can be told without starting it."""
-    platforms = jax.config.jax_platforms
+    platforms: str | None = getattr(jax.config, "jax_platforms")  # noqa: B009, types know no flag
     if platforms:
         return platforms.split(",")[0] == "cpu"
     return not any(map(importlib.util.find_spec, _ACCELERATORS))

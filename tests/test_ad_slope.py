@@ -33,7 +33,7 @@ def loss(at):
     pixels, lights = jnp.asarray(PIXELS, jnp.float32), jnp.asarray(LIGHTS, jnp.float32)
     target = jnp.asarray(TARGET, jnp.float32)
     seen = (pixels > at["edges"][0]) & (pixels < at["edges"][1])
-    shown = jnp.where(seen, lights @ at["light"], 0)
+    shown = seen.astype(jnp.float32) * (lights @ at["light"])
     return jnp.mean(jnp.square(shown - target))
 
 

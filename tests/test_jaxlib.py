@@ -28,7 +28,7 @@ class jax_platforms:
         self.platforms = platforms
 
     def __enter__(self):
-        self.before = jax.config.jax_platforms
+        self.before = getattr(jax.config, "jax_platforms")  # noqa: B009
         jax.config.update("jax_platforms", self.platforms)
 
     def __exit__(self, *_):
