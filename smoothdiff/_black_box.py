@@ -75,7 +75,9 @@ def black_box(
             are lost, an error says so.
         store: A file that keeps each point and its value as it comes. What is there is not
             evaluated again, whether the run went on, failed, was killed or is made once more; so
-            `fun` must give the same value again. Neither errors nor NaN are kept. Several processes
+            `fun` must give the same value again. A point that comes several times in a batch is
+            evaluated once. Neither errors nor NaN are kept, as their reason may be gone the next
+            time: such a point is evaluated each time that it is asked for. Several processes
             may use the file; it is an SQLite database, so on a disk of this machine. It is of one
             function, as checkpoints are. `smoothdiff.load_store` reads it.
 

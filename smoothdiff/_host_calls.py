@@ -19,7 +19,7 @@ from smoothdiff._casts import as_promised
 from smoothdiff._executors import Engine, Outcome, Outcomes, PoolLostError
 from smoothdiff._host_samples import BlackBoxError, Samples
 from smoothdiff._processes import NotImportableError
-from smoothdiff._store import Store
+from smoothdiff._store import Found, Store
 
 _log = logging.getLogger("smoothdiff")
 _OURS = os.path.dirname(__file__), os.path.dirname(concurrent.futures.__file__)
@@ -46,23 +46,30 @@ class HostFunction:
         """Evaluates all samples and writes the results into `outs`, one row per sample."""
         if self.store is None:
             return self._evaluate(samples, outs, out_tree)
-        known = self._fill(self.store, samples, outs)
+        points = self.store.points(samples)
+        known = self._fill(self.store.find(points), outs)
         if known.all():
             return None
-        rest = samples.only(~known)
+        # of samples that are the same point one is evaluated for all
+        seen: dict[str, int] = {}
+        first = np.array([seen.setdefault(point, i) for i, point in enumerate(points)])
+        asked = ~known & (first == np.arange(len(points)))
+        rest = samples.only(asked)
         rows = [np.empty((len(rest), *out.shape[1:]), out.dtype) for out in outs]
         try:
             self._evaluate(rest, rows, out_tree)
         finally:
             self.store.settle()
+        same = ~known & ~asked
         for out, row in zip(outs, rows, strict=True):
-            out[~known] = row
+            out[asked] = row
+            out[same] = out[first[same]]
         return None
 
     def first(self, samples: Samples) -> Any:
         """What a call returns of which nothing is known yet, and which must not fail."""
         if self.store is not None:
-            (found,) = self.store.find(samples)
+            (found,) = self.store.find(self.store.points(samples))
             with contextlib.suppress(ValueError):
                 if found is not None:
                     value = found.tree(flat=False)
@@ -128,10 +135,10 @@ class HostFunction:
                 self.store.put(samples, at, [row[k, ...] for row in rows], out_tree)
         return good
 
-    def _fill(self, store: Store, samples: Samples, outs: Sequence[np.ndarray]) -> np.ndarray:
+    def _fill(self, values: Sequence[Found | None], outs: Sequence[np.ndarray]) -> np.ndarray:
         """Writes the rows that are known, and says which they are."""
-        known = np.zeros(len(samples), bool)
-        for i, found in enumerate(store.find(samples)):
+        known = np.zeros(len(values), bool)
+        for i, found in enumerate(values):
             leaves = [] if found is None else found.leaves
             if [(v.dtype, v.shape) for v in leaves] == [(o.dtype, o.shape[1:]) for o in outs]:
                 known[i] = True

@@ -154,14 +154,18 @@ class Store:
             query = "update function set digest = null where part = ?"
             self._try(lambda file: file.executemany(query, changed), "written to")
 
-    def find(self, samples: Samples) -> list[Found | None]:
-        """The values of the samples that are there, else None."""
+    def points(self, samples: Samples) -> list[str]:
+        """What the samples are called here; the same for those that are the same point."""
+        which = range(len(samples))
+        return [_described(samples.leaves(i), samples.tree, samples.digest)[0] for i in which]
+
+    def find(self, points: Sequence[str]) -> list[Found | None]:
+        """The values of the points that are there, else None."""
         query = "select value from evaluations where point = ?"
-        found: list[Found | None] = [None] * len(samples)
+        found: list[Found | None] = [None] * len(points)
 
         def read(file: sqlite3.Connection) -> None:
-            for i in range(len(samples)):
-                point, _ = _described(samples.leaves(i), samples.tree, samples.digest)
+            for i, point in enumerate(points):
                 if row := file.execute(query, (point,)).fetchone():
                     found[i] = _read(file, row[0])
 
