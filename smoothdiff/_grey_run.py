@@ -109,8 +109,11 @@ class GreyRun:
         )
         within, learner = rendered.within(known.best), state.learner
         misfit = jnp.nan
-        for lesson in jax.random.split(learning, lessons_of(self.rounds, self.planned, self.each)):
-            learner, misfit = self.lessons.teach(lesson, learner, known.best, rendered, within)
+        count = lessons_of(self.rounds, self.planned, self.each)
+        keys = jax.random.split(learning, count)
+        # one by one: to iterate over an array compiles a program of as many outputs, each round
+        for i in range(count):
+            learner, misfit = self.lessons.teach(keys[i], learner, known.best, rendered, within)
         new = GreyState(state.rounds + 1, learner, known, rendered)
         record = GreyRecord(
             round=self.rounds + 1,
