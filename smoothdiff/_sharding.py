@@ -21,7 +21,7 @@ def as_sharding(given: Any) -> NamedSharding | None:
                 f"sharding: the mesh has the axes {given.axis_names}; say along which the samples "
                 f"lie, NamedSharding(mesh, PartitionSpec({given.axis_names[0]!r}))"
             )
-        return NamedSharding(given, PartitionSpec(given.axis_names[0]))
+        given = NamedSharding(given, PartitionSpec(given.axis_names[0]))
     if not isinstance(given, NamedSharding):
         raise TypeError(
             "sharding must be a mesh of devices, such as jax.make_mesh((jax.device_count(),), "
@@ -32,7 +32,8 @@ def as_sharding(given: Any) -> NamedSharding | None:
             f"sharding: samples have one axis, and {given.spec} says where {len(given.spec)} lie: "
             "write PartitionSpec(name) with the name of an axis of the mesh"
         )
-    return given
+    # jax.make_mesh makes axes that one says the sharding of everything for; here XLA finds it out
+    return NamedSharding(Mesh(given.mesh.devices, given.mesh.axis_names), given.spec)
 
 
 def parts(sharding: NamedSharding) -> int:

@@ -11,19 +11,14 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax
 import pytest
-from jaxtyping import install_import_hook
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
 # Programs that are the same in several tests are compiled once a run: the second time, they come
-# from a folder of this run alone.
-CACHE = {
-    "jax_compilation_cache_dir": None,
-    "jax_persistent_cache_min_compile_time_secs": 0.0,
-    "jax_persistent_cache_min_entry_size_bytes": -1,
-}
+# from a folder of this run alone. Processes that tests start have it as well.
+CACHE = {"min_compile_time_secs": "0", "min_entry_size_bytes": "-1"}
 
 # XLA's older, smaller code for fused operations, in one piece: half the time to compile
 QUICK_FLAGS = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
@@ -32,24 +27,24 @@ QUICK_FLAGS = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_sp
 def pytest_configure(config):
     """The quick part compiles with few optimisations; `pytest -m slow` runs what users run.
 
-    Most of a quick test is compiling, which takes less than half as long. Shapes and types of all
-    arguments are checked in the slow part, as that takes a sixth of the time.
+    Most of a quick test is compiling, which takes less than half as long.
     """
     quick = config.option.markexpr != "slow"
     jax.config.update("jax_disable_most_optimizations", quick)
     if quick:  # a tenth of the time goes into the lines of code that XLA's programs would name
         jax.config.update("jax_traceback_in_locations_limit", 0)
-    first = not hasattr(config, "workerinput")  # workers inherit what the first process has set
-    if first:
-        os.environ["JAX_COMPILATION_CACHE_DIR"] = folder = tempfile.mkdtemp()
+    if not hasattr(config, "workerinput"):  # workers inherit what the first process has set
+        folder = tempfile.mkdtemp()
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+        for name, value in CACHE.items():
+            os.environ[f"JAX_PERSISTENT_CACHE_{name.upper()}"] = value
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
         if quick and "XLA_FLAGS" not in os.environ and knows(QUICK_FLAGS):
             os.environ["XLA_FLAGS"] = QUICK_FLAGS
+    # of tests in the first process, which has imported JAX before
+    jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
     for name, value in CACHE.items():
-        jax.config.update(name, os.environ["JAX_COMPILATION_CACHE_DIR"] if value is None else value)
-    if not quick:
-        hook = install_import_hook("smoothdiff", "beartype.beartype")
-        config.add_cleanup(hook.uninstall)
+        jax.config.update(f"jax_persistent_cache_{name}", int(value))
 
 
 def knows(flags):

@@ -104,7 +104,7 @@ def test_levels_that_mislead_are_no_worse_than_the_start():
     hole = sd.Level(lambda y, args: jnp.where(jnp.abs(y - 0.2) < 0.5, y - 0.1, 7.0), 10.0)
     found = sd.coarse_to_fine(sd.least_squares, [far, hole], jnp.zeros(1), key=KEY)
     assert found.fun <= 0.005
-    assert len(found.levels) == 3
+    assert len(found.levels) >= 2
 
 
 @pytest.mark.parametrize("budget", [1.0, 8.0, 20.0])

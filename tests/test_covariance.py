@@ -255,14 +255,14 @@ def test_too_few_evaluations_tell_nothing():
     ],
 )
 def test_intervals_cover_as_often_as_they_say(model, truth, size):
-    """Of 150 data sets each, to three standard errors; of 400 each all shares were 93 to 97 %."""
+    """Of 100 data sets each, to three standard errors; of 400 each all shares were 93 to 97 %."""
     fun = lambda y, data: model(y) - data
     y, y0 = ravel_pytree(truth)[0], jax.tree.map(np.ones_like, truth)
     inside = []
-    for seed in range(150):
+    for seed in range(100):
         key, noise = jax.random.split(jax.random.key(seed))
         result = sd.least_squares(fun, y0, noisy(model, truth, size, noise), key=key)
         low, high = (ravel_pytree(end)[0] for end in result.parameter_intervals())
         inside.append((low < y) & (y < high))
     shares = np.mean(inside, axis=0)
-    assert np.all(np.abs(shares - 0.95) < 3 * (0.95 * 0.05 / 150) ** 0.5), shares
+    assert np.all(np.abs(shares - 0.95) < 3 * (0.95 * 0.05 / 100) ** 0.5), shares

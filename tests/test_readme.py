@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import os
 import re
 import statistics
 import subprocess
@@ -35,7 +36,10 @@ def run(block, folder):
     (folder / "pasted.py").write_text(
         block.code + "\n" if block.page == README else START + block.code
     )
-    ran = subprocess.run([sys.executable, "pasted.py"], cwd=folder, capture_output=True, text=True)
+    env = {**os.environ, "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}  # most of the time is compiling
+    ran = subprocess.run(
+        [sys.executable, "pasted.py"], cwd=folder, env=env, capture_output=True, text=True
+    )
     missing = re.search(r"ModuleNotFoundError: No module named '(\w+)", ran.stderr)
     if missing and missing[1] not in ("smoothdiff", "benchmarks"):
         pytest.skip(f"{missing[1]} is not installed")

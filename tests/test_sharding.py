@@ -21,7 +21,7 @@ import smoothdiff as sd
 
 count = int(sys.argv[1])
 assert jax.device_count() == count
-mesh = Mesh(np.array(jax.devices()), ("samples",))
+mesh = jax.make_mesh((count,), ("samples",))
 square = Mesh(np.array(jax.devices()).reshape(2, -1), ("rows", "samples"))
 of_square = NamedSharding(square, PartitionSpec(("rows", "samples")))
 key, x = jax.random.key(0), jnp.array([0.3, -0.4, 1.2])
