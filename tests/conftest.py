@@ -22,6 +22,23 @@ CACHE = {"min_compile_time_secs": "0", "min_entry_size_bytes": "-1"}
 
 # XLA's older, smaller code for fused operations, in one piece: half the time to compile
 QUICK_FLAGS = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+# what these test is statistics and closed forms, whatever XLA optimises
+UNOPTIMISED = [
+    "arguments",
+    "baselines",
+    "batch",
+    "check_gradient",
+    "control_variate",
+    "filtered_adam",
+    "grid_filters",
+    "leave_out",
+    "mesh_filters",
+    "samplers",
+    "stderr",
+    "support",
+    "transforms",
+    "unbiased",
+]
 
 
 def pytest_configure(config):
@@ -55,9 +72,13 @@ def knows(flags):
 
 
 @pytest.fixture(autouse=True, scope="module")
-def forget_compiled():
+def forget_compiled(request):
     """Drops what a module has compiled: kept, it adds up to gigabytes."""
+    before = jax.config.jax_disable_most_optimizations  # pyright: ignore[reportAttributeAccessIssue]
+    name = request.module.__name__.rpartition("test_")[2]
+    jax.config.update("jax_disable_most_optimizations", before or name in UNOPTIMISED)
     yield
+    jax.config.update("jax_disable_most_optimizations", before)
     jax.clear_caches()
 
 
