@@ -3,6 +3,7 @@
 from typing import Any
 
 import jax
+import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import PyTree
 
@@ -33,7 +34,7 @@ def as_sharding(given: Any) -> NamedSharding | None:
             "write PartitionSpec(name) with the name of an axis of the mesh"
         )
     # jax.make_mesh makes axes that one says the sharding of everything for; here XLA finds it out
-    return NamedSharding(Mesh(given.mesh.devices, given.mesh.axis_names), given.spec)
+    return NamedSharding(Mesh(np.asarray(given.mesh.devices), given.mesh.axis_names), given.spec)
 
 
 def parts(sharding: NamedSharding) -> int:

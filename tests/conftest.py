@@ -74,11 +74,11 @@ def knows(flags):
 @pytest.fixture(autouse=True, scope="module")
 def forget_compiled(request):
     """Drops what a module has compiled: kept, it adds up to gigabytes."""
-    before = jax.config.jax_disable_most_optimizations  # pyright: ignore[reportAttributeAccessIssue]
     name = request.module.__name__.rpartition("test_")[2]
-    jax.config.update("jax_disable_most_optimizations", before or name in UNOPTIMISED)
+    quick = request.config.option.markexpr != "slow"
+    jax.config.update("jax_disable_most_optimizations", quick or name in UNOPTIMISED)
     yield
-    jax.config.update("jax_disable_most_optimizations", before)
+    jax.config.update("jax_disable_most_optimizations", quick)
     jax.clear_caches()
 
 
