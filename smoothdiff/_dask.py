@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from smoothdiff._executors import AllHangError, AtOnce, CallLostError
+from smoothdiff._executors import AllHangError, AtOnce, CallLostError, SuspectError
 from smoothdiff._host_samples import Samples
 from smoothdiff._processes import Seconds
 
@@ -111,6 +111,12 @@ class OnDask(AtOnce):
         except concurrent.futures.CancelledError as error:
             self._sent.clear()  # it went with the workers that had it
             raise CallLostError("the workers that had its arguments died") from error
+        except Exception as error:
+            # Dask counts the deaths of a worker against all calls that it was given, those that
+            # only wait there, too
+            if type(error).__name__ == "KilledWorker":
+                raise SuspectError("its workers died") from error
+            raise
 
     def _stop(self, future: Any) -> None:
         """Kills the worker; its nanny starts another one, and Dask makes its other calls again."""

@@ -25,6 +25,10 @@ class CallLostError(RuntimeError):
     """A call was lost through no fault of its own."""
 
 
+class SuspectError(RuntimeError):
+    """A call was with its worker when that died, and may or may not be why; the cause says how."""
+
+
 # after these no call can be made
 _ENDS = concurrent.futures.BrokenExecutor, AllHangError, NotImportableError
 # how often a call that was lost is made again
@@ -87,6 +91,8 @@ class _Call:
     sample: int | None
     tries: int
     losses: int
+    # whether no other one of the batch is under way
+    alone: bool = False
     future: Any = None
     # since when it is the oldest of those that have not come
     oldest_since: float | None = None
@@ -115,7 +121,8 @@ class AtOnce:
     ) -> Outcomes:
         """What each call returned or raised, as they come.
 
-        All are submitted together, so that no worker waits.
+        All are submitted together, so that no worker waits. A call that may have died of another
+        one is made again alone, after all others.
 
         Args:
             fun: the host function.
@@ -132,10 +139,11 @@ class AtOnce:
         # those that have not come, in the order in which they began
         calls: dict[int, _Call] = {}
         tickets, patience = itertools.count(), None if self.keeps_time else timeout
+        suspects: deque[_Call] = deque()
 
-        def submit(sample: int | None, tries: int, losses: int = 0) -> None:
+        def submit(sample: int | None, tries: int, losses: int = 0, alone: bool = False) -> None:
             ticket = next(tickets)
-            calls[ticket] = _Call(sample, tries, losses)
+            calls[ticket] = _Call(sample, tries, losses, alone)
             try:
                 future = self._submit(fun, samples, sample, timeout)
             except RuntimeError as error:  # it was shut down, or is broken
@@ -150,7 +158,10 @@ class AtOnce:
         try:
             for sample in which:
                 submit(sample, 1)
-            while calls:
+            while calls or suspects:
+                if not calls:
+                    suspect = suspects.popleft()
+                    submit(suspect.sample, suspect.tries, suspect.losses, alone=True)
                 ticket = self._awaited(came, calls, patience)
                 call = calls[ticket]
                 try:
@@ -162,11 +173,14 @@ class AtOnce:
                     give_up(call)
                 del calls[ticket]
                 if isinstance(error, CallLostError) and call.losses < _LOSSES:
-                    submit(call.sample, call.tries, call.losses + 1)
+                    submit(call.sample, call.tries, call.losses + 1, call.alone)
+                elif isinstance(error, SuspectError) and not call.alone:
+                    suspects.append(call)
                 elif error is not None and call.tries <= retries:
                     submit(call.sample, call.tries + 1)
                 else:
-                    yield Outcome(call.sample, call.tries, value, error)
+                    cause = error.__cause__ if isinstance(error, SuspectError) else error
+                    yield Outcome(call.sample, call.tries, value, cause)
         except _ENDS as error:
             raise PoolLostError(error, [call.sample for call in calls.values()]) from error
         finally:

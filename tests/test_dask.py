@@ -76,13 +76,7 @@ def test_more_large_arrays_than_the_workers_keep(client):
 
 
 # new workers take seconds, and Dask gives up a call when four have died of it
-OTHERS = [
-    pytest.mark.slow,
-    pytest.mark.xfail(strict=False, reason="Dask blames a call that waits where four workers die"),
-]
-
-
-@pytest.mark.parametrize("at", [5, *(pytest.param(at, marks=OTHERS) for at in (2, 3, 4))])
+@pytest.mark.parametrize("at", [5, *(pytest.param(at, marks=pytest.mark.slow) for at in (2, 3, 4))])
 def test_a_worker_that_dies_or_hangs_loses_its_call_alone(at, client):
     xs = jnp.array([0.25, at, -0.5, 0.0, 0.0, 0.0])
     f = box(client, on_error="nan", timeout=3.0)
