@@ -182,7 +182,8 @@ class AtOnce:
                     cause = error.__cause__ if isinstance(error, SuspectError) else error
                     yield Outcome(call.sample, call.tries, value, cause)
         except _ENDS as error:
-            raise PoolLostError(error, [call.sample for call in calls.values()]) from error
+            left = [call.sample for call in (*calls.values(), *suspects)]
+            raise PoolLostError(error, left) from error
         finally:
             for call in calls.values():
                 give_up(call)

@@ -33,7 +33,7 @@ def as_sharding(given: Any) -> NamedSharding | None:
             f"sharding: samples have one axis, and {given.spec} says where {len(given.spec)} lie: "
             "write PartitionSpec(name) with the name of an axis of the mesh"
         )
-    # jax.make_mesh makes axes that one says the sharding of everything for; here XLA finds it out
+    # axes of jax.make_mesh are explicit: JAX would ask for the sharding of each array on the way
     return NamedSharding(Mesh(np.asarray(given.mesh.devices), given.mesh.axis_names), given.spec)
 
 

@@ -22,7 +22,8 @@ CACHE = {"min_compile_time_secs": "0", "min_entry_size_bytes": "-1"}
 
 # XLA's older, smaller code for fused operations, in one piece: half the time to compile
 QUICK_FLAGS = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
-# what these test is statistics and closed forms, whatever XLA optimises
+# modules of statistics and closed forms, which hold whatever XLA optimises: quick to compile in the
+# slow part, too
 UNOPTIMISED = [
     "arguments",
     "baselines",
