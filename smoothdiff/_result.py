@@ -41,6 +41,8 @@ class Record(NamedTuple):
         stderr: the standard error of `smoothed`; NaN where the batch cannot tell.
         sigma: the smoothing width of the step, the widest if there are several.
         y: the iterate after the step; None in a history without iterates.
+        best: the point at which the function was `fun`, which a run that is stopped returns; for
+            callbacks, None in a history.
     """
 
     step: int
@@ -51,6 +53,7 @@ class Record(NamedTuple):
     stderr: float
     sigma: float
     y: PyTree[np.ndarray]
+    best: PyTree[np.ndarray] = None
 
 
 @dataclasses.dataclass(frozen=True)

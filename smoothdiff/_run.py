@@ -209,9 +209,11 @@ class Run:
             stderr=progress.stderr.item(),
             sigma=progress.sigma.item(),
             y=jax.device_get(self.units.natural(y)),
+            best=jax.device_get(self.units.natural(progress.lowest_y)),
         )
         # Ctrl-C may come between any two lines: the state has the last word on what was done
-        self.history.append(record if self.keep_iterates else record._replace(y=None))
+        kept = record.y if self.keep_iterates else None
+        self.history.append(record._replace(y=kept, best=None))
         self.y, self.state, self.stopped = y, state, stopped
         if time.monotonic() >= self.save_due:
             self.save()
@@ -258,6 +260,6 @@ def inexact(leaf: Any) -> Array:
 
 
 def _unstack(records: Record) -> list[Record]:
-    rows = zip(*(np.asarray(column).tolist() for column in records[:-1]), strict=True)
+    rows = zip(*(np.asarray(column).tolist() for column in records[:-2]), strict=True)
     at = lambda i: jax.tree.map(operator.itemgetter((i, ...)), records.y)
-    return [Record._make((*row, at(i))) for i, row in enumerate(rows)]
+    return [Record._make((*row, at(i), None)) for i, row in enumerate(rows)]

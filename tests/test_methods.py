@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
+import smoothdiff as sd
 from benchmarks import _registry, _study
 from benchmarks._loop import Counter, Recorder, Stop
 from benchmarks._task import Budget, Grey, Kind, NotAble, Problem
-from benchmarks.methods import grey_box
+from benchmarks.methods import _host_loop, grey_box
 
 START, REFERENCE = np.array([-0.8, 0.9]), np.array([0.7, -0.4])
 LOW, HIGH = -1.0, 1.0
@@ -209,6 +210,14 @@ def test_progress_bounds_and_counts(name):
     assert np.all((points >= LOW) & (points <= HIGH))
     if first is not None:
         assert evaluations[0] == first
+
+
+def test_of_a_search_point_by_point_the_best_that_was_evaluated_is_shown():
+    made = lambda y, smoothed: sd.Record(1, 1, 0.0, 3.0, smoothed, np.nan, 1.0, y, best=7.0)
+    assert _host_loop._Best(0.0).after(made(1.0, np.nan)) == 7
+    # of batches all iterates, until one is at the start again
+    best, seen = _host_loop._Best(0.0), [(1, 5), (2, 6), (0, 9), (3, 7), (4, 4), (5, 8)]
+    assert [best.after(made(*at)) for at in seen] == [1, 2, 2, 2, 4, 5]
 
 
 @pytest.mark.slow

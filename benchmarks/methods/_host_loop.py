@@ -36,9 +36,11 @@ def run_by(minimise: Callable, problem: Problem, fun: Callable[[Y], Any], solver
 
 
 class _Best:
-    """What is shown of a run with restarts: back at y0, after it had moved away.
+    """What is shown of a run: of a solver that goes point by point, the best that was evaluated.
 
-    A search that follows another one is hidden until it has seen something better.
+    That is what a user gets who stops it; its iterates look around, far away too, or begin again
+    elsewhere. Solvers of batches show each iterate, until one is back at y0 after it had moved
+    away: a search that follows another one is hidden until it has seen something better.
     """
 
     def __init__(self, y0: Y):
@@ -46,12 +48,13 @@ class _Best:
         self._moved, self._target = False, np.inf
 
     def after(self, step: Record) -> Y:
+        if math.isnan(step.smoothed):
+            return step.best
         moved = not jax.tree.all(jax.tree.map(np.array_equal, step.y, self._y0))
         if self._moved and not moved:
             self._target = self._lowest
         self._moved = moved
-        value = step.fun if math.isnan(step.smoothed) else step.smoothed
-        self._lowest = min(self._lowest, value)
-        if value < self._target:
+        self._lowest = min(self._lowest, step.smoothed)
+        if step.smoothed < self._target:
             self._target, self._shown = np.inf, step.y
         return self._shown
