@@ -50,6 +50,26 @@ def test_few_parameters_get_newton_cg_and_residuals_gauss_newton(x64):
     assert result.stats["fun"] == result.fun
 
 
+@pytest.mark.parametrize("above", [1, 100])
+def test_a_run_ends_where_only_rounding_is_left(above):
+    """In float32 the last steps promise less than the value can tell."""
+    bent = np.float32([1, 10, 100])
+    fun = lambda y, args: jnp.sum(bent * (y - 1) ** 2) / 2 + above
+    result = sd.minimise(fun, jnp.zeros(3), key=KEY)
+    assert result.reason == "converged"
+    np.testing.assert_allclose(result.fun, above, rtol=1e-6)
+    assert result.evaluations < 25
+
+
+def test_linear_residuals_take_few_evaluations_in_float32():
+    rng = np.random.default_rng(0)
+    design, data = (rng.standard_normal(size).astype(np.float32) for size in ((20, 4), 20))
+    result = sd.least_squares(lambda y, args: design @ y - data, jnp.ones(4), key=KEY)
+    assert result.reason == "converged"
+    assert result.evaluations < 20
+    np.testing.assert_allclose(result.y, np.linalg.lstsq(design, data)[0], atol=2e-3)
+
+
 def test_many_parameters_get_first_order_and_a_support_its_own_solver():
     y0 = jnp.zeros(100)
     result = sd.minimise(lambda y, _: jnp.sum((y - 1) ** 2), y0, key=KEY, max_steps=30)

@@ -138,6 +138,8 @@ class PointStep(eqx.Module):
             scale = jnp.maximum(solver.norm(self.y), solver.norm(params.layout.tree(params.sigma)))
             rounding = math.sqrt(jnp.finfo(theta.dtype).eps) * scale
             small = moved < jnp.maximum(solver.atol + solver.rtol * scale, rounding)
+            # a point that only teaches the model is as long as the radius
+            small |= after.done()
             small &= (solver.rtol > 0) | (solver.atol > 0)
             small &= after.settled() & ~after.plateau(_PLATEAU * rounding)
             small &= after.average is None

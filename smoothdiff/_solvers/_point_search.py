@@ -111,6 +111,10 @@ class AbstractPointSearch(eqx.Module):
     def settled(self) -> Bool[Array, ""]:
         """Whether a short step is a sign of convergence."""
 
+    @abc.abstractmethod
+    def done(self) -> Bool[Array, ""]:
+        """Whether the model promised no more than rounding may take, whatever the radius."""
+
     def over(self, sizes: Sizes) -> Bool[Array, ""]:
         """Whether the search leads nowhere any more, so that another may follow.
 

@@ -21,7 +21,7 @@ from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._point_search import nothing, powers_of_two
-from smoothdiff._solvers._ratio_test import ratio_test, settled
+from smoothdiff._solvers._ratio_test import asks_nothing, nearer, ratio_test, settled
 
 # the most evaluations that a model interpolates, if n parameters do not need more
 _MOST = 256
@@ -39,12 +39,16 @@ _FAILS, _SLOW = 5, 10
 
 
 class Proposal(NamedTuple):
-    """Steps to evaluate, in units of the metric, and what the model says of them."""
+    """Steps to evaluate, in units of the metric, and what the model says of them.
+
+    It is `done` where it promises no more than rounding may take, whatever the radius.
+    """
 
     steps: Float[Array, "K n"]
     reduction: Float[Array, " K"]
     hessian: Float[Array, "n n"]
     poor: Bool[Array, ""]
+    done: Bool[Array, ""]
 
 
 class QuadraticTrust(eqx.Module):
@@ -52,7 +56,7 @@ class QuadraticTrust(eqx.Module):
 
     `improve` says that the next evaluation is for the geometry of the points, not for a step;
     `fails` counts the steps in a row that failed, `slow` the evaluations without a lower point.
-    The last step may be `settled`, see there.
+    The last step may be `settled`, see there, and the model `done`.
     """
 
     metric: Metric
@@ -62,6 +66,7 @@ class QuadraticTrust(eqx.Module):
     fails: Int[Array, ""]
     slow: Int[Array, ""]
     settled: Bool[Array, ""]
+    done: Bool[Array, ""]
 
     @staticmethod
     def start(sigma: Float[Array, " n"], radius: Float[Array, ""]) -> "QuadraticTrust":
@@ -69,7 +74,7 @@ class QuadraticTrust(eqx.Module):
         n, none = len(sigma), jnp.zeros((), jnp.int32)
         hessian = jnp.zeros((n, n), sigma.dtype)
         no = jnp.asarray(False)
-        return QuadraticTrust(Metric.of(sigma, True), radius, hessian, no, none, none, no)
+        return QuadraticTrust(Metric.of(sigma, True), radius, hessian, no, none, none, no, no)
 
     def failed(self) -> Bool[Array, ""]:
         """Whether the model is of no use here, or nothing is left to do for it."""
@@ -88,7 +93,7 @@ class QuadraticTrust(eqx.Module):
         """Trusted again, at least as far as this, around another point."""
         none = jnp.zeros_like(self.fails)
         radius, no = jnp.maximum(self.radius, radius), jnp.zeros_like(self.improve)
-        return QuadraticTrust(self.metric, radius, self.hessian, no, none, none, no)
+        return QuadraticTrust(self.metric, radius, self.hessian, no, none, none, no, no)
 
     def propose(
         self,
@@ -99,7 +104,7 @@ class QuadraticTrust(eqx.Module):
         count: int,
     ) -> Proposal:
         """Minimisers of the model within this radius and others, or a point for the geometry."""
-        grad, hessian, (constant, slope, bend), poor = self._fit(history, center, fun)
+        grad, hessian, (constant, slope, bend), poor, rise = self._fit(history, center, fun)
 
         def minimiser(hessian: Array, grad: Array, radius: Array) -> Array:
             return self._within_bounds(hessian, grad, radius, center, params)
@@ -109,7 +114,8 @@ class QuadraticTrust(eqx.Module):
         reduction = -(dot(steps, grad) + jnp.sum(dot(steps, hessian) * steps, axis=1) / 2)
         # where the model asks for nothing, a point that teaches it something: one of the two ends
         # of what the farthest evaluation determines alone
-        improve = self.improve | ~(reduction[0] > jnp.finfo(fun.dtype).eps * jnp.abs(fun))
+        done, nothing = asks_nothing(reduction[0], fun, rise, steps[0], self.radius)
+        improve = self.improve | nothing
 
         def other() -> Array:
             ends = jnp.stack([minimiser(s * bend, s * slope, self.radius) for s in (1, -1)])
@@ -119,14 +125,15 @@ class QuadraticTrust(eqx.Module):
         first = jax.lax.cond(improve, other, lambda: steps[0])
         steps = steps.at[0].set(first)
         reduction = reduction.at[0].set(jnp.where(improve, 0, reduction[0]))
-        return Proposal(steps, reduction, hessian, poor)
+        return Proposal(steps, reduction, hessian, poor, done)
 
     def _fit(
         self, history: History, center: Array, fun: Array
-    ) -> tuple[Array, Array, tuple[Array, Array, Array], Array]:
+    ) -> tuple[Array, Array, tuple[Array, Array, Array], Array, Array]:
         """Gradient and Hessian; the polynomial of the farthest point, and whether that is too far.
 
-        The polynomial is 1 there and 0 at the other points, as far as they are interpolated.
+        The polynomial is 1 there and 0 at the other points, as far as they are interpolated. Last
+        comes by how much the highest of them is above the center.
         """
         n, dtype = len(center), fun.dtype
         tiny = jnp.finfo(dtype).tiny
@@ -144,7 +151,7 @@ class QuadraticTrust(eqx.Module):
         a = jnp.where(used[:, None], away[near], 0) / width
         rise = jnp.where(used, history.funs[near] - fun, 0)
         typical = jnp.nanmedian(jnp.where(used, jnp.abs(rise), jnp.nan))
-        high = _HIGH * typical + tiny
+        high, highest = _HIGH * typical + tiny, jnp.max(rise)
         above = jnp.clip(rise / high, 1, _HIGHEST)
         rise = jnp.minimum(rise, _HIGHEST * high)
 
@@ -168,7 +175,7 @@ class QuadraticTrust(eqx.Module):
         constants, slopes = solved[:, len(a)], solved[:, len(a) + 1 :] / width
         polynomial = constants[1], slopes[1], bends[1] / width**2
         poor = (distance[farthest] > _FAR * self.radius) & (jnp.sum(used) > n + 1)
-        return slopes[0], (old + bends[0]) / width**2, polynomial, poor
+        return slopes[0], (old + bends[0]) / width**2, polynomial, poor, highest
 
     def _within_bounds(
         self, hessian: Array, grad: Array, radius: Array, center: Array, params: Params
@@ -213,7 +220,7 @@ class QuadraticTrust(eqx.Module):
         lower = jnp.minimum(self.radius, length) * jnp.where(long, 0.1, 0.5)
         radius = jnp.where(failed & ~wait, lower, self.radius)
         radius = jnp.where(held, jnp.maximum(radius, 2 * length), radius)
-        radius = jnp.where(~tried & ~self.improve, self.radius / 2, radius)
+        radius = jnp.where(~tried & ~self.improve, nearer(self.settled) * self.radius, radius)
         return QuadraticTrust(
             metric=metric,
             radius=radius,
@@ -222,4 +229,5 @@ class QuadraticTrust(eqx.Module):
             fails=fails,
             slow=jnp.where(fun < before, 0, self.slow + len(funs)).astype(fails.dtype),
             settled=settled(self.settled, outcome, length, radii[best]),
+            done=proposal.done,
         )

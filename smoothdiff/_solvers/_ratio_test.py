@@ -11,6 +11,10 @@ _FAILED, _HELD = 0.1, 0.7
 _FAR_OFF = 10.0
 # a step of this share of the radius would have been longer without it
 _INSIDE = 0.95
+# a reduction of so many roundings of the value is nothing, a rise of so many is one for sure
+_NOTHING, _TELLING = 8, 1000
+# where the model asks for nothing the next point is so much nearer, if its last step came true
+_NEARER, _NEAREST = 0.5, 0.1
 
 
 class Outcome(NamedTuple):
@@ -52,8 +56,8 @@ def ratio_test(
     failed = tried & ~(ratio > _FAILED)
     long = failed & jnp.isfinite(ratio) & (ratio < -_FAR_OFF)
     count = jnp.where(failed & ~long, fails + 1, jnp.where(tried & ~failed, 0, fails))
-    rounding = jnp.sqrt(jnp.finfo(before.dtype).eps) * jnp.abs(before)
-    return Outcome(tried, failed, tried & (ratio > _HELD), long, count, reduction > rounding)
+    taken = jnp.sqrt(jnp.finfo(before.dtype).eps) * jnp.abs(before)
+    return Outcome(tried, failed, tried & (ratio > _HELD), long, count, reduction > taken)
 
 
 def settled(
@@ -70,3 +74,26 @@ def settled(
     worked = outcome.tried & ~outcome.failed
     inside = ~outcome.more | (length < _INSIDE * radius)
     return inside & (before | worked) & ~(outcome.failed & outcome.more)
+
+
+def asks_nothing(
+    reduction: Float[Array, ""],
+    fun: Float[Array, ""],
+    rise: Float[Array, ""],
+    step: Float[Array, " n"],
+    radius: Float[Array, ""],
+) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    """Whether no step, however long, promises more than rounding takes; or none within the radius.
+
+    A model knows that only if the values that it is fitted to rise by far more than rounding, and
+    if it is not the radius that is too small, as far from the answer of a function of large values.
+    """
+    unit = jnp.finfo(fun.dtype).eps * jnp.abs(fun)
+    done = ~(reduction > _NOTHING * unit) & (rise > _TELLING * unit)
+    done &= jnp.linalg.norm(step) < _INSIDE * radius
+    return done, done | ~(reduction > unit)
+
+
+def nearer(settled: Bool[Array, ""]) -> Float[Array, ""]:
+    """By how much the radius falls after a point of geometry, where the model asks for nothing."""
+    return jnp.where(settled, _NEAREST, _NEARER)

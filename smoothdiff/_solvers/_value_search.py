@@ -141,6 +141,10 @@ class ValueSearch(AbstractPointSearch):
         """The local model's may be none."""
         return ~self.is_local() | self.trust.settled
 
+    def done(self) -> Bool[Array, ""]:
+        """Whether that is the local model."""
+        return self.is_local() & self.trust.done
+
     def lost(self, sizes: Sizes) -> Bool[Array, ""]:
         """Whether neither model leads anywhere; after one converged the wide one may yet."""
         lost = self.center.lost(sizes) & (self.trust.failed() | self._later())
@@ -186,6 +190,7 @@ class ValueSearch(AbstractPointSearch):
             reduction=jnp.zeros(count, self.start.dtype),
             hessian=self.trust.hessian,
             poor=jnp.asarray(False),
+            done=jnp.asarray(False),
         )
 
         def first() -> tuple[Array, Proposal]:
