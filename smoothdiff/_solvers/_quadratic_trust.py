@@ -215,6 +215,8 @@ class QuadraticTrust(eqx.Module):
         outcome = ratio_test(before, fun, reduction, self.fails)
         tried, failed, held, long, fails, _ = outcome
         radii = self.radius * powers_of_two(len(funs), length.dtype)
+        # in the units that the step was made in
+        moved = jnp.linalg.norm(proposal.steps[best])
         # a model of far points is made better before it is trusted less
         wait = proposal.poor & (fails < 2) & ~long
         lower = jnp.minimum(self.radius, length) * jnp.where(long, 0.1, 0.5)
@@ -228,6 +230,6 @@ class QuadraticTrust(eqx.Module):
             improve=failed & proposal.poor,
             fails=fails,
             slow=jnp.where(fun < before, 0, self.slow + len(funs)).astype(fails.dtype),
-            settled=settled(self.settled, outcome, length, radii[best]),
+            settled=settled(self.settled, outcome, moved, radii[best]),
             done=proposal.done,
         )
