@@ -25,6 +25,7 @@ KINDS = {
     "processes": ("raises", "NaN", "hangs", "dies"),
     "dask": ("raises", "NaN", "hangs", "dies"),
 }
+# of minimise; of least_squares, which takes fewer evaluations, three times as many
 RUNS = {"plain": 8, "threads": 3, "processes": 2, "dask": 2}
 # half the sum of squares: about 1 at the start, and without faults below this at the end
 GOOD = 1e-4
@@ -55,7 +56,7 @@ def runs_of(call, way, kinds, folder, **options):
     All have the same program, as it is compiled once, and the same store.
     """
     fun = host_functions.Faulty(folder / "calls", kinds, call == "least_squares")
-    runs = int(os.environ.get("FAULT_RUNS", RUNS[way]))
+    runs = int(os.environ.get("FAULT_RUNS", RUNS[way] * (3 if fun.residuals else 1)))
     starts = np.random.default_rng(0).uniform(-1, 1, (runs, 2))
     with executor_of(way) as executor:
         timeout = {} if executor is None else {"timeout": 2.0}
