@@ -105,6 +105,17 @@ class OnDask(AtOnce):
     def _begun(self, future: Any) -> bool:
         return bool(self._workers(future))
 
+    def _go_on(self, futures: list[Any]) -> list[Any]:
+        """Cancels calls that no worker has; Dask would forget those that run, too."""
+        begun: set[str] = set()
+        if not all(future.done() for future in futures):
+            with contextlib.suppress(Exception):  # the client may be why nothing goes on
+                begun.update(*self._client.processing().values())
+                states = list(self._client.futures.items())
+                begun.update(key for key, state in states if state.status == "finished")
+        runs = [future for future in futures if not future.done() and self._keys[future] in begun]
+        return [future for future in futures if future in runs or not future.cancel()]
+
     def _result(self, future: Any, timeout: Seconds) -> Any:
         try:
             return super()._result(future, timeout)

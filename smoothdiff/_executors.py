@@ -33,6 +33,8 @@ class SuspectError(RuntimeError):
 _ENDS = concurrent.futures.BrokenExecutor, AllHangError, NotImportableError
 # how often a call that was lost is made again
 _LOSSES = 5
+# seconds for calls to end that run when others have failed; a later value is kept if all lives on
+_PROMPT = 2.0
 # what may be raised and is a fault of one call; Ctrl-C is none
 FAULTS = Exception, SystemExit
 
@@ -151,9 +153,12 @@ class AtOnce:
             calls[ticket].future = future
             future.add_done_callback(lambda _: came.put(ticket))
 
-        def give_up(call: _Call) -> None:
-            if call.future is not None and not call.future.cancel():
-                call.future.add_done_callback(functools.partial(_tell, late, call.sample))
+        def give_up(calls: Iterable[_Call], wait: float) -> None:
+            of = {call.future: call.sample for call in calls if call.future is not None}
+            left = self._go_on(list(of))
+            concurrent.futures.wait(left, wait)
+            for future in left:
+                future.add_done_callback(functools.partial(_tell, late, of[future]))
 
         try:
             for sample in which:
@@ -170,7 +175,7 @@ class AtOnce:
                     raise
                 except FAULTS as fault:
                     value, error = None, fault
-                    give_up(call)
+                    give_up([call], 0)
                 del calls[ticket]
                 if isinstance(error, CallLostError) and call.losses < _LOSSES:
                     submit(call.sample, call.tries, call.losses + 1, call.alone)
@@ -185,8 +190,7 @@ class AtOnce:
             left = [call.sample for call in (*calls.values(), *suspects)]
             raise PoolLostError(error, left) from error
         finally:
-            for call in calls.values():
-                give_up(call)
+            give_up(calls.values(), _PROMPT)
 
     def _awaited(self, came: queue.SimpleQueue, calls: dict[int, _Call], timeout: Seconds) -> int:
         """The ticket of the next call that came, or took longer than the timeout.
@@ -233,6 +237,10 @@ class AtOnce:
             return future.result()
         self._stop(future)
         raise TimeoutError(f"no result within {timeout} s")
+
+    def _go_on(self, futures: list[Any]) -> list[Any]:
+        """Cancels calls that have not begun; the others."""
+        return [future for future in futures if not future.cancel()]
 
     def _stop(self, future: Any) -> None:
         """Ends a call that takes too long; threads, and processes of others, cannot be ended."""

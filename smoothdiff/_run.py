@@ -29,11 +29,13 @@ from smoothdiff._unit_space import UnitSpace
 
 # the share of the time that saving may take
 _SAVING = 0.05
-_NONFINITE = (
-    "an estimate was NaN or infinite; `result` has what was found before. If fun fails for some "
-    'samples, give the solver nonfinite="drop", which leaves them out unless they are too many; '
-    "if the iterates run away, take smaller steps or set bounds"
-)
+_NONFINITE = "an estimate was NaN or infinite; `result` has what was found before. "
+_ADVICE = {
+    "propagate": 'If fun fails for some samples, give the solver nonfinite="drop", which leaves '
+    "them out unless they are too many; if the iterates run away, take smaller steps or set bounds",
+    "drop": 'Too few samples were finite for nonfinite="drop" to go on with the others: begin '
+    "where fun is finite, take a smaller sigma, or set bounds within which it is",
+}
 
 
 class Problem(eqx.Module):
@@ -167,9 +169,7 @@ class Run:
         """The function, or half the sum of squares of residuals."""
         with reraise():
             leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(self.problem.value(y))]
-        solver = self.problem.solver
-        solver = solver.ours() if isinstance(solver, Wrapped) else solver
-        if isinstance(solver, optx.AbstractLeastSquaresSolver):
+        if isinstance(self._ours(), optx.AbstractLeastSquaresSolver):
             return float(sum(np.sum(leaf * leaf) for leaf in leaves)) / 2
         return float(leaves[0])
 
@@ -199,7 +199,7 @@ class Run:
             y, state, stopped = jax.block_until_ready(self.problem.step(self.y, self.state))
         progress = state.progress
         if not progress.finite:
-            raise MinimiseError(_NONFINITE, self.found("nonfinite", progress))
+            raise self._nonfinite(progress)
         record = Record(
             step=progress.step.item(),
             evaluations=progress.evaluations.item(),
@@ -225,9 +225,18 @@ class Run:
             y, stats = jax.block_until_ready(self.problem.judge(self.y, self.state))
         # a last batch that fails costs no more than the smoothed value
         if not jnp.isfinite(stats["fun"]):
-            raise MinimiseError(_NONFINITE, self.found("nonfinite"))
+            raise self._nonfinite()
         numbers = {name: value.item() for name, value in stats.items()}
         return self._result(y, reason, **numbers)
+
+    def _ours(self) -> Any:
+        """The solver, or the one of ours within another."""
+        solver = self.problem.solver
+        return solver.ours() if isinstance(solver, Wrapped) else solver
+
+    def _nonfinite(self, progress: Progress | None = None) -> MinimiseError:
+        advice = _ADVICE[getattr(self._ours(), "nonfinite", "propagate")]
+        return MinimiseError(_NONFINITE + advice, self.found("nonfinite", progress))
 
     def found(self, reason: str, progress: Progress | None = None) -> Result:
         """The result of a run that was cut short: no evaluation is made for it."""

@@ -1,5 +1,6 @@
 """Functions for worker processes, which import this file: NumPy only. No tests here."""
 
+import hashlib
 import os
 import sys
 import time
@@ -37,6 +38,14 @@ def a_while(x):
     return x
 
 
+def fails_if_negative(x):
+    """Takes |x| seconds."""
+    time.sleep(abs(float(x)))
+    if x < 0:
+        raise ValueError("negative")
+    return x
+
+
 def process(x):
     """The process that it is called in; x only makes it another call."""
     return np.int32(os.getpid())
@@ -64,3 +73,51 @@ class FirstTime:
 def of_an_image(x, scene):
     """The sum of a large array, in a tree."""
     return x + scene["image"].sum()
+
+
+class Faulty:
+    """A bent valley with a fault at one point in ten, the same one each time.
+
+    Args:
+        folder: where it writes down its calls.
+        kinds: of faults, in equal shares.
+        residuals: whether it returns two residuals, or half the sum of their squares.
+    """
+
+    def __init__(self, folder, kinds, residuals):
+        self.folder, self.kinds, self.residuals = Path(folder), kinds, residuals
+        self.folder.mkdir()
+
+    def __call__(self, y):
+        kind = self.kind(y)
+        with (self.folder / y.tobytes().hex()).open("a") as file:
+            file.write("x")
+        match kind:
+            case "raises":
+                raise ValueError("no convergence")
+            case "hangs":  # nobody can end a thread, so not for ever
+                time.sleep(3)
+                raise ValueError("too late")
+            case "dies":
+                os._exit(1)
+        r = np.array([2 * (y[1] - y[0] ** 2), 1 - y[0]], y.dtype)
+        value = r if self.residuals else np.sum(r**2) / 2
+        if kind == "shape":
+            return np.zeros(7)
+        return value * np.nan if kind == "NaN" else value
+
+    def kind(self, y):
+        """The fault at a point, or None."""
+        chance = int.from_bytes(hashlib.blake2b(y.tobytes(), digest_size=4).digest(), "big")
+        return None if chance % 10 else self.kinds[chance // 10 % len(self.kinds)]
+
+    def calls(self):
+        """How often it was called with each point that is no fault, and the points that are one."""
+        good, bad = {}, []
+        for file in self.folder.iterdir():
+            point = np.frombuffer(bytes.fromhex(file.name), np.float32)
+            if self.kind(point) is None:
+                good[tuple(point.tolist())] = len(file.read_text())
+            else:
+                bad.append(point)
+        return good, bad

@@ -56,6 +56,15 @@ def test_a_call_that_failed_is_tried_again(way, client, tmp_path):
     assert flaky.tries() == {0.0: 2, 1.0: 2, 2.0: 2}
 
 
+def test_what_runs_when_another_call_fails_is_kept(client, tmp_path):
+    f = box(client, host_functions.fails_if_negative, store=tmp_path / "store")
+    with pytest.raises(sd.BlackBoxError, match="sample 0 of 22: raised ValueError: negative"):
+        jax.vmap(f)(jnp.append(jnp.array([-0.3, 0.8]), 0.2 + jnp.arange(20) / 64))
+    kept = {float(value) for _, value in sd.load_store(tmp_path / "store")}
+    assert np.float32(0.8) in kept
+    assert len(kept) < 10  # what no worker had was not begun
+
+
 def test_large_arguments_are_sent_once(client, monkeypatch):
     sent = []
     scatter = client.scatter

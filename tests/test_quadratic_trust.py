@@ -143,3 +143,11 @@ def test_it_works_in_float32_and_under_vmap():
     assert steps.dtype == jnp.float32
     np.testing.assert_allclose(center + steps[1], BEST, atol=1e-3)
     assert np.linalg.norm(steps[0]) == pytest.approx(0.1, rel=1e-3)
+
+
+def test_evaluations_that_all_came_back_to_the_center_leave_the_others_in_the_model(x64):
+    """As steps below rounding do; the nearest 2 n + 1 would else be one point."""
+    again = np.zeros((2 * N + 3, N))
+    history = known(np.concatenate([around(2 * N + 1), again]), lambda x: x @ x)
+    _, proposal, *_ = proposal_of(history)
+    np.testing.assert_allclose(proposal.hessian, 2 * np.eye(N), atol=1e-6)

@@ -33,7 +33,7 @@ from smoothdiff._solvers._random_numbers import in_step, takes_key
 PATIENCE = 20
 # values that are the same at points further apart than so many roots of the rounding: a plateau
 _PLATEAU = 3
-# of at least so many evaluations half must be finite where others may be dropped
+# of the last evaluations, at least so many, one must be finite where others may be dropped
 _ENOUGH = 10
 # the widths of later searches without bounds, relative to sigma, as powers of two at random
 _WIDTHS = 2.0

@@ -138,7 +138,11 @@ class QuadraticTrust(eqx.Module):
         n, dtype = len(center), fun.dtype
         tiny = jnp.finfo(dtype).tiny
         away = self.metric.into(history.points - center[None])
-        everywhere = jnp.where(history.valid, jnp.linalg.norm(away, axis=1), jnp.inf)
+        length = jnp.linalg.norm(away, axis=1)
+        # steps below rounding come back to the center, which once is enough of
+        again = history.valid & (length == 0) & (history.funs == fun)
+        again &= jnp.arange(len(away)) != jnp.argmax(again)
+        everywhere = jnp.where(history.valid & ~again, length, jnp.inf)
         count = max(min((n + 1) * (n + 2) // 2, _MOST), 2 * n + 1)
         nearest, near = jax.lax.top_k(-jnp.asarray(everywhere), min(count, len(away)))
         distance = -jnp.asarray(nearest)
