@@ -42,7 +42,7 @@ from smoothdiff._support import local_support, matrix_support, moving_support, p
 from smoothdiff._unbounded import Periodic, Positive, Real
 from smoothdiff._with_covariance import with_covariance
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "AbstractBaseline",

@@ -28,10 +28,9 @@ def control_variate(
 
     $$ T[f] = T[f - h] + T[h] $$
 
-    All transforms are linear in the function. The first part needs few samples where h is near f;
-    the second has many samples of h and none of f. Both parts are unbiased, whatever h is, if their
-    sampler and baseline are: a bad surrogate costs accuracy and is no mistake. The baseline of the
-    first part is that of what h leaves.
+    All transforms T are linear in the function. f - h needs few samples where h is near f. h needs
+    many samples, and none of f. Both parts are unbiased for any h if their sampler and baseline
+    are, so a bad surrogate costs accuracy and makes no bias. The baseline is applied to f - h.
 
     Args:
         transform: `smooth`, `smooth_grad`, `smooth_value_and_grad`, `smooth_jacobian`,

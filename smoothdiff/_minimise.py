@@ -82,10 +82,10 @@ def minimise(
         sigma: the smoothing width of the default solver, in the units of the parameters: how far
             from y0 to look at first. A number or a pytree like the parameters.
         target: a value that is good enough: the run ends where one as low was seen.
-        max_evaluations: evaluations of `fun` that are never exceeded. Those that judge the result
-            are set aside first, as many as noise would ask for; without noise some are left over.
-            Without this and `max_steps`, 200 (n + 1) for `NewtonCG` and `GaussNewton` with n < 100
-            parameters, which end by themselves, and 256 steps for others.
+        max_evaluations: the most evaluations of `fun`, never exceeded. Some are set aside to judge
+            the result under noise; without noise they may stay unused. If neither this nor
+            `max_steps` is given, the limit is 200 (n + 1) for `NewtonCG` and `GaussNewton` with
+            n < 100 parameters, which end by themselves before, and 256 steps for others.
         max_steps: steps after which to stop.
         max_seconds: seconds after which no further step begins.
         space: what each parameter may be, such as `Range(1e-3, 10, log=True)`: one space, or a

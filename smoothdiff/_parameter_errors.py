@@ -83,9 +83,7 @@ class ParameterErrors:
         elif np.any(unknown):
             said.append(
                 f"no error of {_listed(names[unknown])}: the evaluations do not tell how the "
-                "residuals depend on them. Either they do not, or only on a combination, or it "
-                f"takes the {2 * np.sum(~held)} evaluations of sd.with_covariance(fun, result, "
-                "args)"
+                "residuals depend on them. " + _why(bool(answer.more), 2 * np.sum(~held))
             )
         if said:
             warnings.warn("; ".join(said), stacklevel=5)
@@ -125,6 +123,21 @@ class ParameterErrors:
 
     def _dtype(self) -> np.dtype:
         return layout_of(self.answer.y).dtype
+
+
+def _why(further: bool, count: int) -> str:
+    """What may help, before and after `with_covariance`."""
+    call = "sd.with_covariance(fun, result, args)"
+    if not further:
+        return (
+            "Either they do not, or only on a combination, or it takes the "
+            f"{count} evaluations of {call}"
+        )
+    return (
+        "Either they do not, or only on a combination, or they jump or curve as near as was "
+        f"looked. Then call {call} again, which mostly looks nearer, or make the function "
+        "smoother, by finer time steps say"
+    )
 
 
 def _listed(names: np.ndarray) -> str:

@@ -61,15 +61,15 @@ class Result:
     """What `minimise` found.
 
     Attributes:
-        y: the best point. Of a function without noise, always the lowest that was evaluated. With
-            noise, found by evaluating that point again, the winner of fresh evaluations of a few
-            candidates, the start among them; with `takes_key` what is said there. If the run was
-            cut short ("interrupted", or an error) the lowest that was evaluated, which with noise
-            may be luck.
+        y: the best point. Without noise it is the lowest that was evaluated. With noise, which
+            shows when that point is evaluated again, a few candidates are evaluated afresh, the
+            start among them, and the lowest wins. For `takes_key=True` see `minimise`. If the run
+            was cut short ("interrupted", or an error), it is the lowest that was evaluated, which
+            with noise may be luck.
         fun: the function there; of least squares half the sum of squares. With noise, the mean of
             three fresh evaluations.
-        smoothed: the smoothed function there, from a last batch; a point of that batch which is
-            lower still has become `y`. NaN if the run was cut short, or if a sample was not finite.
+        smoothed: the smoothed function there, from a last batch. If a point of that batch is lower
+            still, it becomes `y`. NaN if the run was cut short, or if a sample was not finite.
         stderr: the standard error of `smoothed`.
         evaluations: evaluations of the function, the judgement included; not those of a step that
             was broken off.

@@ -31,7 +31,8 @@ def with_covariance(
     `Result.covariance` is free, as it makes do with the evaluations of the run. Where those do not
     tell the slopes at the answer, it is NaN and warns. Then this evaluates the residuals two
     standard errors to both sides along each principal axis of the ellipsoid that they are known to
-    have. It can be called again, when these are known better.
+    have. It can be called again, when these are known better: a first call may look too far, where
+    the function jumps or curves, and leave NaN. Its warning says so.
 
     Args:
         fun: the residuals, as for `least_squares`.

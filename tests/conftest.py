@@ -65,6 +65,15 @@ def pytest_configure(config):
         jax.config.update(f"jax_persistent_cache_{name}", int(value))
 
 
+@pytest.fixture(scope="session")
+def quickly_compiled():
+    """The environment of a process of its own that compiles as the quick part does."""
+    quick = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1", "JAX_TRACEBACK_IN_LOCATIONS_LIMIT": "0"}
+    if "XLA_FLAGS" not in os.environ and knows(QUICK_FLAGS):
+        quick["XLA_FLAGS"] = QUICK_FLAGS
+    return quick
+
+
 def knows(flags):
     """Whether this jaxlib has the flags: XLA ends a process that gives it others."""
     start = [sys.executable, "-c", "import jax; jax.devices()"]

@@ -188,6 +188,15 @@ def test_a_run_that_was_cut_short_needs_more_evaluations():
         sd.with_covariance(lambda y, _: jnp.ones(7), result)
 
 
+def test_jumps_within_the_further_evaluations_are_named():
+    steps = lambda y: jnp.round(decay(y))
+    data = noisy(steps, TRUTH, 0.1)
+    result = fitted(steps, data, TRUTH, max_steps=3)
+    more: Any = sd.with_covariance(lambda y, data: steps(y) - data, result, data)
+    with pytest.warns(UserWarning, match=r"jump or curve.*sd\.with_covariance.* again"):
+        assert np.isnan(more.covariance).all()
+
+
 def test_an_answer_of_an_earlier_search_is_evaluated_again():
     data = noisy(decay, TRUTH, 0.1)
     result = fitted(decay, data, TRUTH, max_steps=25)

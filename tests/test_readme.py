@@ -31,12 +31,12 @@ def named(page):
     return str(page.relative_to(ROOT))
 
 
-def run(block, folder):
+def run(block, folder, environment):
     """Runs a block as its reader would: pasted into a file in an empty folder."""
     (folder / "pasted.py").write_text(
         block.code + "\n" if block.page == README else START + block.code
     )
-    env = {**os.environ, "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}  # most of the time is compiling
+    env = {**os.environ, **environment}
     ran = subprocess.run(
         [sys.executable, "pasted.py"], cwd=folder, env=env, capture_output=True, text=True
     )
@@ -49,8 +49,8 @@ def run(block, folder):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("block", [b for b in CODE if not b.why_not], ids=str)
-def test_examples_run_alone(block, tmp_path):
-    printed = run(block, tmp_path)
+def test_examples_run_alone(block, tmp_path, quickly_compiled):
+    printed = run(block, tmp_path, quickly_compiled)
     for said in re.findall(r"print\(.*\)  # close to \[(.*)\]", block.code):
         shown = re.search(r"\[(.*?)\]", printed)
         assert shown, printed
@@ -82,6 +82,19 @@ def check_arguments(call):
     if any(p.kind is p.VAR_KEYWORD for p in taken.values()):
         return
     assert {k.arg for k in call.keywords if k.arg} <= set(taken), ast.unparse(call)
+
+
+def test_the_version_is_the_same_everywhere():
+    said = {
+        "pyproject.toml": r'^version = "(.*)"$',
+        "CITATION.cff": r"^version: (.*)$",
+        "CHANGELOG.md": r"^## \[(\d.*?)\] - \d{4}-\d\d-\d\d$",
+        "docs/citing.md": r"^  version = \{(.*)\},$",
+    }
+    for name, pattern in said.items():
+        found = re.search(pattern, (ROOT / name).read_text(), re.MULTILINE)
+        assert found, name
+        assert found[1] == sd.__version__, name
 
 
 def test_readme_is_short():

@@ -35,38 +35,38 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     The function returns residuals, such as an image minus its reference, and every evaluation
     teaches all of them. What is sought is a small sum of squares, $\min_y \frac12 \sum_p r_p(y)^2$.
 
-    With fewer than 100 parameters the function is evaluated point by point. The first points are
-    the start, and one sigma from it along each parameter. Where the loss there is more than ten
-    times as high, a nearer point follows, and all widths of that parameter are as much smaller.
-    Where all residuals are the same, pairs of points follow, each four times as far away, up to a
-    thousand sigma, and then the first points again, as far as these found a change.
-    From then on a step needs one evaluation: J is the fit to the nearest points that differs least
-    from the last J, $y_t$ is the best point, and the radius $\Delta$ grows where the residuals come
-    as predicted and shrinks where the loss does not fall. Where steps fail in a row, a shorter step
-    is predicted no better than a longer one, or residuals do not change at all, as on functions
-    that jump, a wide regression takes over. It samples rounds of points around a center, which may
-    go uphill:
+    With fewer than 100 parameters the function is evaluated point by point.
+
+    - **The first points** are the start, and one sigma from it along each parameter. If the loss
+      there is more than ten times as high, a nearer point follows, and the widths of that parameter
+      shrink as much. If all residuals are the same, pairs of points follow, each four times as far
+      away, up to a thousand sigma. Where these find a change, the first points are taken again.
+    - **The local model** needs one evaluation a step. $y_t$ is the best point. J fits the nearest
+      points, and of all that do it differs least from the last J. The radius $\Delta$ grows if the
+      reduction is as predicted, and shrinks if the loss does not fall.
+    - **The wide regression** takes over on functions that jump: when steps fail in a row, when a
+      shorter step is predicted no better than a longer one, or when no residual changes. It samples
+      rounds of points around a center, which may go uphill:
 
     $$ r(y + \sigma u) \approx m + J u + e, \qquad
        u = -(J^T \Gamma^{-1} J + I)^{-1} J^T \Gamma^{-1} m $$
 
-    $\Gamma$, the covariance of what a linear model of the last `history` evaluations leaves, is the
-    metric: pixels that jump at random have no say, and where all do, the step is damped as by
-    Levenberg and Marquardt. Once two of its steps in a row come true, or 6 (n + 1) evaluations
-    have led to nothing lower, the local model goes on.
+    The metric $\Gamma$ is the covariance of what a linear model of the last `history` evaluations
+    leaves. So pixels that jump at random have no say. Where all do, the step is damped as by
+    Levenberg and Marquardt. The local model goes on once two steps of the regression in a row are
+    as predicted, or once 6 (n + 1) evaluations have found nothing lower.
 
     With 100 parameters and more, or with a schedule of sigma, each step takes a batch, and the
-    wide regression alone. Where a batch says little about each of so many parameters, 12 of the
-    evaluations go to the ends of 12 steps, and the best is taken if it is an improvement: the one
-    above at several lengths, and steps by a Jacobian of which only those entries are kept that
-    cannot be chance. That finds by itself which residuals a parameter moves, if these are few, from
-    a number of samples that grows with the logarithm of n. It takes n x P numbers for P residuals,
-    and is left out where that is more than 2e8.
+    wide regression alone. A batch may say little about each of so many parameters. Then 12 of the
+    evaluations go to the ends of 12 steps, and the best is taken if it is an improvement. Some are
+    the step above at several lengths. The others use a Jacobian without the entries that may be
+    chance. That finds the sparsity pattern, which residuals a parameter moves, if these are few,
+    from a number of samples that grows with the logarithm of n. It takes n x P numbers for P
+    residuals, and is left out where that is more than 2e8.
 
     Nothing larger than history x history or n x n, for fewer than 100 parameters, is factorised.
     Records have the `smoothed` loss, $\mathbb{E}_z[\frac12 \sum_p r_p(y + \sigma z)^2]$, with
-    batches only. The `smoothed` loss of the result is that of
-    the last model, or of a last batch.
+    batches only. The `smoothed` loss of the result is that of the last model, or of a last batch.
 
     Args:
         sigma: the smoothing width in the units of the parameters, positive for each of them: how
