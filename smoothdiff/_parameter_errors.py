@@ -83,7 +83,7 @@ class ParameterErrors:
         elif np.any(unknown):
             said.append(
                 f"no error of {_listed(names[unknown])}: the evaluations do not tell how the "
-                "residuals depend on them. " + _why(bool(answer.more), 2 * np.sum(~held))
+                "residuals depend on them. " + _why(bool(answer.more), 2 * int(np.sum(~held)))
             )
         if said:
             warnings.warn("; ".join(said), stacklevel=5)

@@ -330,10 +330,10 @@ def test_restarts_find_the_deeper_well():
     firsts = []
     for seed in range(2):
         run = functools.partial(solve, two_wells, (-0.5, 0), seed=seed, bounds=(-9, 9))
-        result = run(max_evaluations=3000, restarts=99)
+        result = run(max_evaluations=1500, restarts=99)
         np.testing.assert_allclose(result.y, [2, 0], atol=0.02)
         assert result.fun < 0.01
-        firsts.append(run(max_evaluations=1500).y[0])
+        firsts.append(run(max_evaluations=500).y[0])
     # or the test would show nothing
     assert min(firsts) < -1
 

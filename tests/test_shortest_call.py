@@ -63,7 +63,8 @@ def test_a_run_ends_where_only_rounding_is_left(above):
 
 def test_linear_residuals_take_few_evaluations_in_float32():
     rng = np.random.default_rng(0)
-    design, data = (rng.standard_normal(size).astype(np.float32) for size in ((20, 4), 20))
+    design = rng.standard_normal((20, 4)).astype(np.float32)
+    data = rng.standard_normal(20).astype(np.float32)
     result = sd.least_squares(lambda y, args: design @ y - data, jnp.ones(4), key=KEY)
     assert result.reason == "converged"
     assert result.evaluations < 20
