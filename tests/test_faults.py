@@ -1,8 +1,8 @@
 """Host functions with a fault at one point in ten, under everything that makes their calls.
 
 A run ends with an answer as good as without faults, or with an error that names the point. A second
-one pays for no point twice, but for those that failed, and under Dask those that were lost. FAULT_RUNS=50 in the environment makes 50
-runs of each in place of a few.
+one pays for no point twice, but for those that failed, and under Dask those that were lost.
+FAULT_RUNS=50 in the environment makes 50 runs of each in place of a few.
 """
 
 import contextlib
