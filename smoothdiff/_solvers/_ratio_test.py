@@ -13,6 +13,8 @@ _FAR_OFF = 10.0
 _INSIDE = 0.95
 # a reduction of so many roundings of the value is nothing, a rise of so many is one for sure
 _NOTHING, _TELLING = 8, 1000
+# where the model asks for nothing the next point is so much nearer, if its last step came true
+_NEARER, _NEAREST = 0.5, 0.1
 
 
 class Outcome(NamedTuple):
@@ -90,3 +92,8 @@ def asks_nothing(
     done = ~(reduction > _NOTHING * unit) & (rise > _TELLING * unit)
     done &= jnp.linalg.norm(step) < _INSIDE * radius
     return done, done | ~(reduction > unit)
+
+
+def nearer(settled: Bool[Array, ""]) -> Float[Array, ""]:
+    """By how much the radius falls after a point of geometry, where the model asks for nothing."""
+    return jnp.where(settled, _NEAREST, _NEARER)

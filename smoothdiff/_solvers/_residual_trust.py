@@ -19,7 +19,7 @@ from smoothdiff._solvers._base import dot
 from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._point_search import powers_of_two
-from smoothdiff._solvers._ratio_test import asks_nothing, ratio_test, settled
+from smoothdiff._solvers._ratio_test import asks_nothing, nearer, ratio_test, settled
 
 # evaluations that a fit may use for each parameter, and how far they count, in radii
 _USED, _REACH, _FARTHEST = 3, 1.5, 2.0
@@ -186,12 +186,11 @@ class TrustRegion(eqx.Module):
         error = jnp.asarray(jnp.where(jnp.isfinite(fun), error, jnp.inf))
         same = jnp.all(rows[best] == row)
         outcome = ratio_test(before, fun, reduction, self.fails)
-        tried, failed, held, long, fails, more = outcome
+        tried, failed, held, long, fails, _ = outcome
         radii = self.radius * powers_of_two(len(funs), length.dtype)
         shorter = (self.fails > 0) & (length < _SHORTER * self.length)
-        # what rounding may take says nothing of the function
-        jumps = more & (same | (shorter & (error >= _SMOOTH * self.error)))
-        rough = jnp.where(jumps, self.rough + 1, self.rough)
+        more = same | (shorter & (error >= _SMOOTH * self.error))
+        rough = jnp.where(more, self.rough + 1, self.rough)
         rough = jnp.where(tried & ~failed, 0, jnp.where(failed & ~long, rough, self.rough))
         # the lowest point of the parabola through both values and the slope
         slope = proposal.slope[best]
@@ -202,9 +201,8 @@ class TrustRegion(eqx.Module):
         radius = jnp.where(failed & ~wait, lower, self.radius)
         grow = held & (error < _PREDICTED)
         radius = jnp.where(grow, jnp.maximum(radius, 2 * length), radius)
-        radius = jnp.where(~tried & ~self.improve, 0.5 * radius, radius)
+        radius = jnp.where(~tried & ~self.improve, nearer(self.settled) * radius, radius)
         improve = failed & proposal.poor & ~self.improve
-        quick = (fun < (1 - _LITTLE) * before) | grow
         revised = TrustRegion(
             radius=radius,
             jacobian=proposal.jacobian,
@@ -213,7 +211,7 @@ class TrustRegion(eqx.Module):
             rough=rough.astype(fails.dtype),
             error=jnp.where(failed, error, self.error),
             length=jnp.where(failed, length, self.length),
-            slow=jnp.where(quick, 0, jnp.where(tried & ~more, self.slow, self.slow + len(rows))),
+            slow=jnp.where((fun < (1 - _LITTLE) * before) | grow, 0, self.slow + len(rows)),
             worked=self.worked | (tried & ~failed),
             settled=settled(self.settled, outcome, length, radii[best]),
             done=proposal.done,
