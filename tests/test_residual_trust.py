@@ -121,7 +121,6 @@ def outcome(fun, trust=None, predicted=0.5):
         slope=jnp.ones(1),
         jacobian=one,
         poor=jnp.asarray(False),
-        done=jnp.asarray(False),
     )
     trust = trust or TrustRegion.start(jnp.asarray(1.0), 1, 1)
     row = jnp.full((1, 1), fun)

@@ -91,10 +91,6 @@ class ResidualSearch(AbstractPointSearch):
         """The local model's may be none."""
         return ~self.is_local() | self.trust.settled
 
-    def done(self) -> Bool[Array, ""]:
-        """Whether that is the local model."""
-        return self.is_local() & self.trust.done
-
     def lost(self, sizes: Sizes) -> Bool[Array, ""]:
         """Whether it converged, or so many evaluations in a row were no lower."""
         return self.converged() | (self.stale >= sizes.patience)
@@ -142,7 +138,6 @@ class ResidualSearch(AbstractPointSearch):
             slope=jnp.zeros(count, dtype),
             jacobian=self.trust.jacobian,
             poor=jnp.asarray(False),
-            done=jnp.asarray(False),
         )
 
         def first() -> tuple[Array, Proposal]:

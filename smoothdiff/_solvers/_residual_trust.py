@@ -19,7 +19,7 @@ from smoothdiff._solvers._base import dot
 from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._point_search import powers_of_two
-from smoothdiff._solvers._ratio_test import asks_nothing, nearer, ratio_test, settled
+from smoothdiff._solvers._ratio_test import ratio_test, settled
 
 # evaluations that a fit may use for each parameter, and how far they count, in radii
 _USED, _REACH, _FARTHEST = 3, 1.5, 2.0
@@ -44,10 +44,7 @@ _SHORTER, _SMOOTH = 0.6, 0.8
 
 
 class Proposal(NamedTuple):
-    """Steps to evaluate, in units of sigma, and what the model says of them.
-
-    It is `done` where it promises no more than rounding may take, whatever the radius.
-    """
+    """Steps to evaluate, in units of sigma, and what the model says of them."""
 
     steps: Float[Array, "K n"]
     predicted: Float[Array, "K P"]
@@ -55,7 +52,6 @@ class Proposal(NamedTuple):
     slope: Float[Array, " K"]
     jacobian: Float[Array, "n P"]
     poor: Bool[Array, ""]
-    done: Bool[Array, ""]
 
 
 class TrustRegion(eqx.Module):
@@ -66,7 +62,7 @@ class TrustRegion(eqx.Module):
     one before and predicted no better, as happens where a function jumps, or changed nothing at
     all; `error` and `length` are those of the last one. `worked` says that some step did not fail,
     and `slow` counts the evaluations in a row that lowered the loss by little or nothing, while the
-    radius did not grow. The last step may be `settled`, see there, and the model `done`.
+    radius did not grow. The last step may be `settled`, see there.
     """
 
     radius: Float[Array, ""]
@@ -79,7 +75,6 @@ class TrustRegion(eqx.Module):
     worked: Bool[Array, ""]
     slow: Int[Array, ""]
     settled: Bool[Array, ""]
-    done: Bool[Array, ""]
 
     @staticmethod
     def start(radius: Float[Array, ""], n: int, size: int) -> "TrustRegion":
@@ -87,7 +82,7 @@ class TrustRegion(eqx.Module):
         none, zero = jnp.zeros((), jnp.int32), jnp.zeros_like(radius)
         jacobian = jnp.zeros((n, size), radius.dtype)
         no = jnp.asarray(False)
-        return TrustRegion(radius, jacobian, no, none, none, zero, zero, no, none, no, no)
+        return TrustRegion(radius, jacobian, no, none, none, zero, zero, no, none, no)
 
     def failed(self) -> Bool[Array, ""]:
         """Whether a local model is of no use."""
@@ -117,28 +112,24 @@ class TrustRegion(eqx.Module):
         count: int,
     ) -> Proposal:
         """Minimisers of the model within this radius and others, or a point for the geometry."""
-        jacobian, lacking, poor, highest = self._fit(history, center, row, sigma)
+        jacobian, lacking, poor = self._fit(history, center, row, sigma)
         hessian, grad = dot(jacobian, jacobian.T), dot(jacobian, row)
         radii = self.radius * powers_of_two(count, row.dtype)
         steps = jax.vmap(lambda radius: bounded_step(hessian, grad, radius, *sides))(radii)
         change, slope = dot(steps, jacobian), -dot(steps, grad)
         reduction = slope - jnp.sum(change**2, axis=1) / 2
         # where the model asks for nothing, a point that teaches it something
-        fun = jnp.sum(row**2) / 2
-        done, nothing = asks_nothing(reduction[0], fun, highest - fun, steps[0], self.radius)
-        improve = self.improve | nothing
+        eps = jnp.finfo(row.dtype).eps
+        improve = self.improve | ~(reduction[0] > eps * jnp.sum(row**2))
         other = _roomy(self.radius * lacking, *sides)
         steps = steps.at[0].set(jnp.where(improve, other, steps[0]))
         reduction = reduction.at[0].set(jnp.where(improve, 0, reduction[0]))
-        return Proposal(steps, row[None] + change, reduction, slope, jacobian, poor, done)
+        return Proposal(steps, row[None] + change, reduction, slope, jacobian, poor)
 
     def _fit(
         self, history: History, center: Array, row: Array, sigma: Array
-    ) -> tuple[Array, Array, Array, Array]:
-        """The Jacobian; the direction that is covered least, and whether that is too little.
-
-        Last comes the highest loss of those that it is fitted to.
-        """
+    ) -> tuple[Array, Array, Array]:
+        """The Jacobian; the direction that is covered least, and whether that is too little."""
         n = len(center)
         tiny = jnp.finfo(row.dtype).tiny
         away = (history.points - center[None]) / sigma[None]
@@ -167,8 +158,7 @@ class TrustRegion(eqx.Module):
         close = far <= _FARTHEST * jnp.maximum(self.radius / width, _CLOSE)
         covered, directions = jnp.linalg.eigh(dot(jnp.where(close[:, None], a, 0).T, a))
         least = jnp.sqrt(jnp.maximum(covered[0], 0))
-        highest = jnp.max(jnp.where(used, history.funs[near], 0))
-        return jacobian, directions[:, 0], least < _COVERED * self.radius / width, highest
+        return jacobian, directions[:, 0], least < _COVERED * self.radius / width
 
     def revise(
         self, proposal: Proposal, row: Float[Array, " P"], rows: Float[Array, "K P"], good: Array
@@ -201,7 +191,7 @@ class TrustRegion(eqx.Module):
         radius = jnp.where(failed & ~wait, lower, self.radius)
         grow = held & (error < _PREDICTED)
         radius = jnp.where(grow, jnp.maximum(radius, 2 * length), radius)
-        radius = jnp.where(~tried & ~self.improve, nearer(self.settled) * radius, radius)
+        radius = jnp.where(~tried & ~self.improve, 0.5 * radius, radius)
         improve = failed & proposal.poor & ~self.improve
         revised = TrustRegion(
             radius=radius,
@@ -214,7 +204,6 @@ class TrustRegion(eqx.Module):
             slow=jnp.where((fun < (1 - _LITTLE) * before) | grow, 0, self.slow + len(rows)),
             worked=self.worked | (tried & ~failed),
             settled=settled(self.settled, outcome, length, radii[best]),
-            done=proposal.done,
         )
         return revised
 
