@@ -53,7 +53,7 @@ def test_few_parameters_get_newton_cg_and_residuals_gauss_newton(x64):
 @pytest.mark.parametrize("above", [1, 100])
 def test_a_run_ends_where_only_rounding_is_left(above):
     """In float32 the last steps promise less than the value can tell."""
-    bent = np.float32([1, 10, 100])
+    bent = np.array([1, 10, 100], np.float32)
     fun = lambda y, args: jnp.sum(bent * (y - 1) ** 2) / 2 + above
     result = sd.minimise(fun, jnp.zeros(3), key=KEY)
     assert result.reason == "converged"
