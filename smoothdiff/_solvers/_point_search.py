@@ -114,7 +114,7 @@ class AbstractPointSearch(eqx.Module):
     def done(self) -> Bool[Array, ""]:
         """Whether the model promised no more than rounding may take, whatever the radius.
 
-        Residuals have errors of parameters, which take evaluations around the answer all the same.
+        Never for residuals: errors of parameters take evaluations around the answer.
         """
         return jnp.asarray(False)
 

@@ -21,7 +21,7 @@ from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._point_search import nothing, powers_of_two
-from smoothdiff._solvers._ratio_test import asks_nothing, nearer, ratio_test, settled
+from smoothdiff._solvers._ratio_test import asks_nothing, ratio_test, settled
 
 # the most evaluations that a model interpolates, if n parameters do not need more
 _MOST = 256
@@ -226,7 +226,7 @@ class QuadraticTrust(eqx.Module):
         lower = jnp.minimum(self.radius, length) * jnp.where(long, 0.1, 0.5)
         radius = jnp.where(failed & ~wait, lower, self.radius)
         radius = jnp.where(held, jnp.maximum(radius, 2 * length), radius)
-        radius = jnp.where(~tried & ~self.improve, nearer(self.settled) * self.radius, radius)
+        radius = jnp.where(~tried & ~self.improve, self.radius / 2, radius)
         return QuadraticTrust(
             metric=metric,
             radius=radius,

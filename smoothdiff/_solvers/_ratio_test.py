@@ -13,8 +13,6 @@ _FAR_OFF = 10.0
 _INSIDE = 0.95
 # a reduction of so many roundings of the value is nothing, a rise of so many is one for sure
 _NOTHING, _TELLING = 8, 1000
-# where the model asks for nothing the next point is so much nearer, if its last step came true
-_NEARER, _NEAREST = 0.5, 0.1
 
 
 class Outcome(NamedTuple):
@@ -83,17 +81,20 @@ def asks_nothing(
     step: Float[Array, " n"],
     radius: Float[Array, ""],
 ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-    """Whether no step, however long, promises more than rounding takes; or none within the radius.
+    """Whether a model is done, and whether it has nothing to try within the radius.
 
-    A model knows that only if the values that it is fitted to rise by far more than rounding, and
-    if it is not the radius that is too small, as far from the answer of a function of large values.
+    It is done where no step, however long, promises more than rounding takes. A model knows that
+    only if its values rise by far more than rounding. And the radius must not be too small for a
+    promise, as it can be where the function is large.
+
+    Args:
+        reduction: what the step promises.
+        fun: the value where it begins.
+        rise: how far above that the highest value is that the model is fitted to.
+        step: the minimiser within the radius, in the same units.
+        radius: that of the trust region.
     """
     unit = jnp.finfo(fun.dtype).eps * jnp.abs(fun)
     done = ~(reduction > _NOTHING * unit) & (rise > _TELLING * unit)
     done &= jnp.linalg.norm(step) < _INSIDE * radius
     return done, done | ~(reduction > unit)
-
-
-def nearer(settled: Bool[Array, ""]) -> Float[Array, ""]:
-    """By how much the radius falls after a point of geometry, where the model asks for nothing."""
-    return jnp.where(settled, _NEAREST, _NEARER)

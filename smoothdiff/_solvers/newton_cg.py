@@ -74,8 +74,9 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
             or "drop" it.
         rtol: relative tolerance. The run has converged when three steps in a row are below
             `atol + rtol * max(norm(y), norm(sigma))`, unless only the radius made them short, or
-            they failed where the model promised more than rounding may take. Where other searches
-            are to follow one goes on until its patience ends: its wide samples may find more.
+            they failed where the model promised more than rounding may take. A point counts as a
+            small step if the model promises no more than rounding takes. If other searches are to
+            follow, a search goes on until its patience ends: its wide samples may find more.
         atol: absolute tolerance. With both zero no run converges; else the tolerance is at least
             the root of the rounding of `max(norm(y), norm(sigma))`.
         norm: the norm of steps and iterates.
