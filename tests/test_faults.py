@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from parts import quick_of
 
 import smoothdiff as sd
 
@@ -30,7 +29,8 @@ RUNS = {"plain": 8, "threads": 1, "processes": 1, "dask": 1}
 # half the sum of squares: about 1 at the start, and without faults below this at the end
 GOOD = 1e-4
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # Dask's own, as its workers come and go
+# Dask warns as its workers come and go
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
 
 
 @contextlib.contextmanager
@@ -95,7 +95,7 @@ def check_paid_once(way, before, good):
 CASES = [f"{call} {way}" for way in KINDS for call in ("minimise", "least_squares")]
 
 
-@pytest.mark.parametrize("case", quick_of(CASES, ["minimise plain"]))
+@pytest.mark.parametrize("case", CASES)
 def test_faults_leave_the_answer_as_good_and_nothing_is_paid_for_twice(case, tmp_path):
     call, way = case.split()
     nan = {"on_error": "nan", "on_nonfinite": "nan"}
@@ -108,7 +108,7 @@ def test_faults_leave_the_answer_as_good_and_nothing_is_paid_for_twice(case, tmp
     check_paid_once(way, before, good)
 
 
-@pytest.mark.parametrize("case", quick_of(CASES, ["least_squares plain"]))
+@pytest.mark.parametrize("case", CASES)
 def test_an_error_names_the_point_and_nothing_is_paid_for_twice(case, tmp_path):
     call, way = case.split()
     fun, before, ends = runs_of(call, way, (*KINDS[way], "shape"), tmp_path)
