@@ -102,8 +102,8 @@ class OnDask(AtOnce):
         key = self._keys[future]
         return [worker for worker, keys in self._client.processing().items() if key in keys]
 
-    def _begun(self, future: Any) -> bool:
-        return bool(self._workers(future))
+    def _place(self, future: Any) -> str | None:
+        return next(iter(self._workers(future)), None)
 
     def _go_on(self, futures: list[Any]) -> list[Any]:
         """Cancels calls that no worker has; Dask would forget those that run, too."""

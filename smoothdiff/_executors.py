@@ -96,8 +96,9 @@ class _Call:
     # whether no other one of the batch is under way
     alone: bool = False
     future: Any = None
-    # since when it is the oldest of those that have not come
+    # since when it is the oldest of those that have not come, and who has it
     oldest_since: float | None = None
+    place: Any = None
 
 
 class AtOnce:
@@ -196,7 +197,8 @@ class AtOnce:
         """The ticket of the next call that came, or took longer than the timeout.
 
         The clock runs for the oldest call alone. Executors begin calls in order, so it does not
-        count the wait for a worker, unless others use the executor too.
+        count the wait for a worker, unless others use the executor too. It starts anew for a call
+        that has lost its worker to another call.
         """
         while True:
             oldest, call = next(iter(calls.items()))
@@ -210,11 +212,14 @@ class AtOnce:
             except queue.Empty:
                 if self.glances_every is not None:
                     self._glance()
-                if left is None or time.monotonic() < now + left:
+                if left is None:
                     continue
-                if call.future.done() or self._begun(call.future):
+                place, before = self._place(call.future), call.place
+                call.place = place
+                if place is None or before not in (None, place):
+                    call.oldest_since = None
+                elif time.monotonic() >= now + left:
                     return oldest
-                call.oldest_since = None
             else:
                 if ticket in calls:  # else it was given up before
                     return ticket
@@ -227,10 +232,10 @@ class AtOnce:
         del timeout
         return self._executor.submit(fun, *samples.arguments(sample))
 
-    def _begun(self, future: Any) -> bool:
-        """Whether a call has a worker, as far as that is known."""
+    def _place(self, future: Any) -> Any:
+        """The worker that has a call, as far as that is known; None without one."""
         del future
-        return True
+        return "any"
 
     def _result(self, future: Any, timeout: Seconds) -> Any:
         if future.done():

@@ -1,7 +1,7 @@
 """Host functions with a fault at one point in ten, under everything that makes their calls.
 
-A run ends with an answer as good as without faults, or with an error that names the point. A second
-one pays for no point twice, but for those that failed, and under Dask those that were lost.
+A run ends with an answer as good as without faults, or with an error that names the point. It and a
+second one pay for no point twice, but for those that failed, and under Dask those that were lost.
 FAULT_RUNS=50 in the environment makes 50 runs of each in place of a few.
 """
 
@@ -81,14 +81,13 @@ def runs_of(call, way, kinds, folder, **options):
     return fun, before, first + again
 
 
-def check_paid_once(way, before, good):
-    """No good point is called twice, and none at all in the second runs.
+def check_paid_once(way, good):
+    """No good point is called twice.
 
     Under Dask a good call may be lost with the worker that had its result, or time out while
     workers start: then it is made again.
     """
     if way != "dask":
-        assert good == before
         assert set(good.values()) == {1}
 
 
@@ -105,13 +104,15 @@ def test_faults_leave_the_answer_as_good_and_nothing_is_paid_for_twice(case, tmp
         assert end.fun < GOOD
     good, bad = fun.calls()
     assert bad  # else this tells nothing
-    check_paid_once(way, before, good)
+    check_paid_once(way, good)
+    if way != "dask":
+        assert good == before  # the second runs took all from the store
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_an_error_names_the_point_and_nothing_is_paid_for_twice(case, tmp_path):
     call, way = case.split()
-    fun, before, ends = runs_of(call, way, (*KINDS[way], "shape"), tmp_path)
+    fun, _, ends = runs_of(call, way, (*KINDS[way], "shape"), tmp_path)
     good, bad = fun.calls()
     assert bad
     for end in ends:
@@ -119,4 +120,5 @@ def test_an_error_names_the_point_and_nothing_is_paid_for_twice(case, tmp_path):
             assert any(repr(point) in str(end) for point in bad), end
         else:
             assert end.fun < GOOD
-    check_paid_once(way, before, good)
+    # after an error the second run may call points that the first had not come to
+    check_paid_once(way, good)
