@@ -20,8 +20,9 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 # from a folder of this run alone. Processes that tests start have it as well.
 CACHE = {"min_compile_time_secs": "0", "min_entry_size_bytes": "-1"}
 
-# XLA's older, smaller code for fused operations, in one piece: half the time to compile
-QUICK_FLAGS = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+# XLA's older, smaller code for fused operations, in one piece, as optimised as any: half the time
+# to compile. Tests of a plain install go without.
+FLAGS = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 # modules of statistics and closed forms, which hold whatever XLA optimises: quick to compile in the
 # slow part, too
 UNOPTIMISED = [
@@ -43,7 +44,7 @@ UNOPTIMISED = [
 
 
 def pytest_configure(config):
-    """The quick part compiles with few optimisations; `pytest -m slow` runs what users run.
+    """The quick part compiles with few optimisations, `pytest -m slow` with all.
 
     Most of a quick test is compiling, which takes less than half as long.
     """
@@ -57,8 +58,8 @@ def pytest_configure(config):
         for name, value in CACHE.items():
             os.environ[f"JAX_PERSISTENT_CACHE_{name.upper()}"] = value
         os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
-        if quick and "XLA_FLAGS" not in os.environ and knows(QUICK_FLAGS):
-            os.environ["XLA_FLAGS"] = QUICK_FLAGS
+        if "XLA_FLAGS" not in os.environ and knows(FLAGS):
+            os.environ["XLA_FLAGS"] = FLAGS
     # of tests in the first process, which has imported JAX before
     jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
     for name, value in CACHE.items():
@@ -68,10 +69,13 @@ def pytest_configure(config):
 @pytest.fixture(scope="session")
 def quickly_compiled():
     """The environment of a process of its own that compiles as the quick part does."""
-    quick = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1", "JAX_TRACEBACK_IN_LOCATIONS_LIMIT": "0"}
-    if "XLA_FLAGS" not in os.environ and knows(QUICK_FLAGS):
-        quick["XLA_FLAGS"] = QUICK_FLAGS
-    return quick
+    return {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1", "JAX_TRACEBACK_IN_LOCATIONS_LIMIT": "0"}
+
+
+@pytest.fixture(scope="session")
+def as_users():
+    """The environment of a process of its own that compiles as users' do."""
+    return {k: v for k, v in os.environ.items() if (k, v) != ("XLA_FLAGS", FLAGS)}
 
 
 def knows(flags):

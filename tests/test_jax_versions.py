@@ -46,7 +46,7 @@ print(jax.__version__)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("version", VERSIONS)
-def test_transforms_and_solvers_run_with_other_versions_of_jax(version, tmp_path):
+def test_transforms_and_solvers_run_with_other_versions_of_jax(version, tmp_path, as_users):
     python = tmp_path / "venv" / "bin" / "python"
     subprocess.run([sys.executable, "-m", "venv", tmp_path / "venv"], check=True)
     install = [python, "-m", "pip", "install", "--quiet", version, ROOT]
@@ -54,6 +54,7 @@ def test_transforms_and_solvers_run_with_other_versions_of_jax(version, tmp_path
     if installed.returncode != 0:
         pytest.skip(f"cannot be installed here: {installed.stderr[-300:]}")
     script = [python, "-W", "error", "-W", "ignore::DeprecationWarning", "-c", SCRIPT]
-    done = subprocess.run(script, capture_output=True, text=True, timeout=500, cwd=tmp_path)
+    run = {"env": as_users, "capture_output": True, "text": True, "timeout": 500}
+    done = subprocess.run(script, cwd=tmp_path, **run)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith(version.partition("==")[2].rstrip(".*"))

@@ -68,8 +68,8 @@ def empty(built, tmp_path_factory):
 
 
 @pytest.mark.parametrize("block", pages.blocks(README), ids=str)
-def test_readme_works_after_a_plain_install(block, empty, tmp_path):
+def test_readme_works_after_a_plain_install(block, empty, tmp_path, as_users):
     (tmp_path / "pasted.py").write_text(block.code)
     # -I: nothing but what is installed there can be imported
-    ran = run(empty, "-I", "pasted.py", cwd=tmp_path)
+    ran = run(empty, "-I", "pasted.py", cwd=tmp_path, env=as_users)
     assert ran.returncode == 0, ran.stderr
