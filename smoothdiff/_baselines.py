@@ -75,7 +75,7 @@ class AbstractBaseline(eqx.Module):
         return 0
 
     def check_gaussian(self, draws: Draws) -> None:
-        """Raises ValueError if it is no Gaussian that smooths."""
+        """Raises ValueError where another kernel than the Gaussian smooths."""
         if isinstance(draws.sampler, NoiseSampler):
             raise ValueError(
                 f"{self} knows its own smoothed value for Gaussian smoothing only: use "

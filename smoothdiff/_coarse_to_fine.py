@@ -80,7 +80,7 @@ class CoarseToFine:
 
     @property
     def fun(self) -> float:
-        """The function of that level there."""
+        """The value there of that level's function."""
         return self.levels[-1].fun
 
     @property

@@ -73,7 +73,7 @@ class AbstractSpace(abc.ABC):
 
     @abc.abstractmethod
     def to_natural(self, u: ArrayLike) -> Array:
-        """The natural value at a unit coordinate; never out of the range, by rounding neither."""
+        """The natural value at a unit coordinate; never out of the range, not even by rounding."""
 
     def to_axis(self, u: ArrayLike) -> Array:
         """Where plots show a unit coordinate: the natural value."""
