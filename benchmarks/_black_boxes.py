@@ -42,6 +42,7 @@ def measure(name: str, options: Namespace, folder: Path, bar: tqdm | None = None
     keep = _atlas.MARKS if _registry.task(name).kind == "scene" else ()
     how = {"setting": setting(options), "fresh": options.fresh, "progress": bar}
     for task in _registry.family(name, options.full):
+        _check(task)
         seeds = range(options.seeds or task.seeds)
         best = _best(task, methods, folder / "tuned" / task.name) if options.tuned else []
         raw = folder / "raw" / task.name
@@ -54,6 +55,14 @@ def measure(name: str, options: Namespace, folder: Path, bar: tqdm | None = None
     if bar is not None:
         bar.clear()  # what is printed next would be on its line
     return {"title": _registry.task(name).title, "tasks": tasks}
+
+
+def _check(task: Task) -> None:
+    """Black boxes are compared by the same errors, so each says what is sought."""
+    if task.score.errors is not None:
+        raise ValueError(f"{task.name!r} has errors of its own, which only a Descent may have.")
+    if task.score.reference is None and task.choose is None:
+        raise ValueError(f"{task.name!r} does not say what is sought: Score(reference=...).")
 
 
 def _best(task: Task, methods: Sequence[Method], folder: Path) -> list[Method]:

@@ -194,10 +194,11 @@ class Runner:
         length = lambda y: np.linalg.norm(flat(y).astype(float) - flat(sought))
         away = length if score.distance is None else jax.jit(score.distance)
         distance = np.array([float(away(y)) for y in points])
+        relative = partial(_relative, of=f"start {seed} of {self._task.name!r}")
         return {
-            "image_error": gap / gap[0],
-            "parameter_error": distance / distance[0],
-            **({} if score.optimum is None else {"gap": gap}),
+            "image_error": _diverged(relative(gap, "loss above its lowest value")),
+            "parameter_error": _diverged(relative(distance, "distance from what is sought")),
+            **({} if score.optimum is None else {"gap": _diverged(gap)}),
             "distance": float(distance[-1]),
         }
 
@@ -205,8 +206,22 @@ class Runner:
         assert self._task.score.errors is not None
         errors, scene = jax.jit(self._task.score.errors), self._task.problem.scene()
         each = [errors(y, scene) for y in points]
-        found = {name: np.array([float(one[name]) for one in each]) for name in each[0]}
-        return {name: np.where(np.isnan(of), np.inf, of) for name, of in found.items()}  # diverged
+        return {name: _diverged([float(one[name]) for one in each]) for name in each[0]}
+
+
+def _relative(errors: np.ndarray, what: str, of: str) -> np.ndarray:
+    """Errors in units of the first, where there is something to reduce."""
+    if not 0 < errors[0] < np.inf:
+        raise ValueError(
+            f"The {what} is {errors[0]:g} at {of}, and errors are relative to that. Begin "
+            "elsewhere, or say in Score what the lowest value is (optimum, 0 by default)."
+        )
+    return errors / errors[0]
+
+
+def _diverged(errors: Any) -> np.ndarray:
+    """The same, infinite where they are NaN: such a run has nothing to show."""
+    return np.where(np.isnan(errors), np.inf, errors)
 
 
 def run(

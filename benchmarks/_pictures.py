@@ -96,8 +96,9 @@ def panel(
         three = np.maximum(quartiles, FLOORS[error])
         label = name_of(name, found["title"])
         band(axis, costs, three, look[name], label, 0.15 if name in banded else 0)
+        axis.update_datalim([(end, 1) for end in curve["ends"]])  # of one that diverged too
         shown = three[1][np.isfinite(three[1])]
-        lowest, highest = min(lowest, *shown), max(highest, *shown)
+        lowest, highest = min([lowest, *shown]), max([highest, *shown])  # there may be none
     axis.set(ylim=(lowest / 1.3, highest * 1.3))
     axis.set(xscale="log", yscale="log", xlabel=LABELS[cost], title=LABELS[error])
     for level in (level for level in LEVELS[error].values() if level >= lowest):
@@ -145,7 +146,8 @@ def _film(task: dict[str, Any], path: Path) -> None:
                 axis.imshow(picture, interpolation="nearest")
                 axis.set(xticks=[], yticks=[])
                 axis.spines[:].set_visible(False)
-                axis.set_xlabel(f"{short(100 * error)} % left", fontsize=8)
+                left = None if error is None else 100 * error
+                axis.set_xlabel(f"{short(left)} % left", fontsize=8)
             line[0].set_xlabel("")
             line[-1].set_xlabel("")
             weight = "bold" if is_ours(name) else "normal"

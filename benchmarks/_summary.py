@@ -110,7 +110,8 @@ def without_one(values: Sequence[float]) -> dict[str, float | None]:
 
 def quarters(values: Any) -> list[Any]:
     """Lower quartile, median and upper quartile over the first axis, with means between values."""
-    return np.quantile(values, [0.25, 0.5, 0.75], axis=0).tolist()
+    with np.errstate(invalid="ignore"):  # between infinities the mean is NaN, which is no number
+        return np.quantile(values, [0.25, 0.5, 0.75], axis=0).tolist()
 
 
 def band(runs: list[Run], error: str, cost: str, costs: Any) -> list[list[float]]:

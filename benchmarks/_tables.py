@@ -35,7 +35,8 @@ def ending(results: dict[str, Any]) -> tuple[list[Grid], list[str]]:
     for task in filter(able, results["tasks"].values()):
         grid = reached(task, brief=True)
         rows = (row._replace(name=MARK * row.strong + row.name) for row in grid.rows)
-        grids.append(grid._replace(rows=tuple(rows)))
+        if grid.rows:
+            grids.append(grid._replace(rows=tuple(rows)))
         lines.append(others(task))
     if _compared_by_gap(results):
         grids.append(_family(results))

@@ -138,16 +138,19 @@ def _terms(residuals: Callable[[Y], jax.Array], support: Any, y: Y) -> jax.Array
 class Score:
     """How what was found is scored; nothing of it is counted or seen by a method.
 
+    The image error is the loss above its lowest value, relative to that of the start, whether there
+    is an image or not. So a start has to be above the lowest value.
+
     Args:
         reference: The y that is sought.
         loss: The loss without noise, or None where the problem's has none.
         image: A picture of y without noise, y -> (H, W, 3) linear RGB, or None.
         distance: How far y is from what is sought, y -> number, where that is not the length of
             their difference: wrong switches, or the poses that a network says. Or None.
-        optimum: The lowest value of the loss, or None. With it, runs are also scored by how far
-            above it they are.
-        errors: Errors by name, (y, scene) -> numbers, in place of those of image and parameters;
-            or None.
+        optimum: The lowest value of the loss, or None, which is 0. With it, runs are also scored by
+            how far above it they are.
+        errors: Errors by name, (y, scene) -> numbers, in place of those of image and parameters,
+            of a `Descent`; or None.
         levels: What runs are asked to get each error down to, by its name; for `errors`.
     """
 

@@ -1,6 +1,8 @@
-"""What the site adds to mkdocs: MathML, notebooks, and what pages link to in the repository."""
+"""What the site adds to mkdocs: MathML, notebooks, entries of the API, and what pages link to."""
 
 import html
+import inspect
+import pkgutil
 import posixpath
 import re
 from pathlib import Path
@@ -10,10 +12,14 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from nbconvert import MarkdownExporter
 
+import smoothdiff as sd
+
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = ROOT / "notebooks"
 # where these say README they mean, on the site, the page with the same content
 PAGES = {"benchmarks/README.md": "../evidence.md", "CONTRIBUTING.md": "", "CHANGELOG.md": ""}
+ENTRY = re.compile(r"^::: smoothdiff\.(\w+)", re.MULTILINE)
+OTHERS = re.compile(r"^::: others of ([\w.]+)$", re.MULTILINE)
 LINK = re.compile(r"\]\(([^)#\s]+)")
 EQUATION = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 
@@ -51,6 +57,19 @@ def as_pages(path: Path) -> list[tuple[str, str | bytes]]:
         text = text.replace(f"]({name})", f"]({path.stem}/{name})")
     pictures = [(f"{folder}/{name}", data) for name, data in resources["outputs"].items()]
     return [(f"{folder}.md", text), *pictures]
+
+
+def on_page_markdown(markdown: str, **_: object) -> str:
+    """`::: others of CLASS` stands for all public subclasses that the page does not name."""
+    named = ENTRY.findall(markdown)
+
+    def entries(match: re.Match[str]) -> str:
+        base = pkgutil.resolve_name(match[1])
+        public = {name: getattr(sd, name) for name in sd.__all__ if name not in named}
+        found = [n for n, it in public.items() if inspect.isclass(it) and issubclass(it, base)]
+        return "\n\n".join(f"::: smoothdiff.{n}\n    options:\n      members: false" for n in found)
+
+    return OTHERS.sub(entries, markdown)
 
 
 def on_page_content(content: str, **_: object) -> str:

@@ -4,6 +4,7 @@ from smoothdiff import filters, kernels, plot, surrogates
 from smoothdiff._aggregate import Aggregate
 from smoothdiff._baselines import AbstractBaseline
 from smoothdiff._black_box import black_box
+from smoothdiff._box import Uniform
 from smoothdiff._call import Options
 from smoothdiff._check_gradient import GradientCheck, check_gradient
 from smoothdiff._coarse_to_fine import CoarseToFine, Level, coarse_to_fine
@@ -25,7 +26,7 @@ from smoothdiff._quadratic import HessianOperator, QuadraticModel
 from smoothdiff._ranges import Integer, Range
 from smoothdiff._recommend import Recommendation, recommend
 from smoothdiff._result import MinimiseError, Record, Result
-from smoothdiff._samplers import AbstractSampler, Gaussian, Orthogonal, Sobol, Uniform
+from smoothdiff._samplers import AbstractSampler, Gaussian, Orthogonal, Sobol
 from smoothdiff._search import Search
 from smoothdiff._smooth import smooth
 from smoothdiff._smooth_first import smooth_grad, smooth_jacobian, smooth_value_and_grad

@@ -36,6 +36,10 @@ class Aggregate(PointSampler):
             under order 2 by -8 % at N = 8, -2 % at 24 and -0.6 % at 64. With "none" it is not.
         share: of the plain Gaussian; 0 is the sampler as published.
 
+    Raises:
+        ValueError: another order, a share that is none; when points are drawn, an odd `num_samples`
+            with `antithetic=True`.
+
     Example:
         >>> import jax, jax.numpy as jnp, smoothdiff as sd
         >>> f = lambda x: jnp.floor(jnp.sum(x))

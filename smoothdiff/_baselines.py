@@ -47,12 +47,24 @@ class Constant(Control):
 
 
 class AbstractBaseline(eqx.Module):
-    """Decides what is subtracted from each sample.
+    r"""Decides what is subtracted from each sample.
+
+    $$ \hat F = \frac1N \sum_i w_i (f_i - b_i) + \mathbb{E}[w b] $$
 
     An estimate stays unbiased when what is subtracted from sample i does not depend on sample i.
     `termwise` says that what is subtracted from a term is a constant, so that the parameters which
     cannot influence the term are not blamed for the baseline either. `slope` says that it needs the
     derivative by AD at theta, with respect to z, in place of f(theta).
+
+    Example:
+        >>> import jax, jax.numpy as jnp, smoothdiff as sd
+        >>> g = sd.smooth_grad(jnp.sum, 0.5, baseline=sd.LeastSquares(1), num_samples=64)
+        >>> isinstance(sd.LeastSquares(1), sd.AbstractBaseline)
+        True
+        >>> print(g(jax.random.key(0), jnp.ones(2)).round(3))
+        [1. 1.]
+
+    Source: own.
     """
 
     termwise: ClassVar[bool] = True
@@ -63,7 +75,7 @@ class AbstractBaseline(eqx.Module):
         return 0
 
     def check_gaussian(self, draws: Draws) -> None:
-        """Raises ValueError if it is no Gaussian that smooths."""
+        """Raises ValueError where another kernel than the Gaussian smooths."""
         if isinstance(draws.sampler, NoiseSampler):
             raise ValueError(
                 f"{self} knows its own smoothed value for Gaussian smoothing only: use "

@@ -120,6 +120,8 @@ def black_box(
         ...         store="runs/simulate.db",
         ...     )
         ...     result = sd.minimise(lambda y, args: f(y), y0, key=key)
+
+    Source: own.
     """
     if fun is None:
         return functools.partial(

@@ -61,6 +61,15 @@ class Options(TypedDict, total=False):
         has_aux: the function returns (value, aux); aux comes back with one row per sample.
         stderr: also return the standard error of the estimate. Do not differentiate what a
             transform returns then: derivatives are lost, silently.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, smoothdiff as sd
+        >>> options: sd.Options = {"num_samples": 32, "baseline": "mean", "bounds": (0.0, 1.0)}
+        >>> g = sd.smooth_grad(lambda x: jnp.sum(jnp.round(x)), 0.1, **options)
+        >>> g(jax.random.key(0), jnp.full(3, 0.5)).shape
+        (3,)
+
+    Source: own.
     """
 
     argnums: int | Sequence[int]

@@ -35,6 +35,16 @@ class GradientCheck:
         gradient: what it should be, the gradient of the smoothed function.
         level: the chance that a right gradient is called wrong in any entry.
         evaluations: evaluations of the function, and as many of the gradient.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, smoothdiff as sd
+        >>> steps = jax.jit(lambda y: jnp.sum(y**2 + jnp.floor(y[0])))
+        >>> by_ad, y = jax.jit(jax.grad(steps)), jnp.ones(2)
+        >>> check = sd.check_gradient(by_ad, steps, y, 0.5, key=jax.random.key(0))
+        >>> check.passed, [bool(wrong) for wrong in check.wrong]
+        (False, [True, False])
+
+    Source: own.
     """
 
     wrong: PyTree[np.ndarray]

@@ -30,6 +30,17 @@ class Level(NamedTuple):
     Attributes:
         fun: as for `minimise` or `least_squares`. The residuals of two levels may differ in number.
         cost: in any unit that all levels share: seconds, rays, time steps.
+
+    Example:
+        >>> import jax.numpy as jnp, smoothdiff as sd
+        >>> def drawn(pixels):
+        ...     x = (jnp.arange(pixels) + 0.5) / pixels
+        ...     bar = lambda y: (x < y).astype(float)
+        ...     return sd.Level(lambda y, args: bar(y) - bar(0.7), cost=pixels)
+        >>> [drawn(pixels).cost for pixels in (16, 256)]
+        [16, 256]
+
+    Source: own.
     """
 
     fun: Callable[[PyTree, PyTree], Any]
@@ -43,6 +54,20 @@ class CoarseToFine:
     Attributes:
         levels: the result of each level that was reached, the coarsest first.
         cost: of all evaluations, in those of the finest level.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, smoothdiff as sd
+        >>> def drawn(pixels):
+        ...     x = (jnp.arange(pixels) + 0.5) / pixels
+        ...     bar = lambda y: (x < y).astype(float)
+        ...     return sd.Level(lambda y, args: bar(y) - bar(0.7), cost=pixels)
+        >>> found = sd.coarse_to_fine(
+        ...     sd.least_squares, [drawn(16), drawn(64)], 0.4, key=jax.random.key(0), bounds=(0, 1)
+        ... )
+        >>> len(found.levels), round(float(found.y), 1)
+        (2, 0.7)
+
+    Source: own.
     """
 
     levels: tuple[Result, ...]
@@ -55,7 +80,7 @@ class CoarseToFine:
 
     @property
     def fun(self) -> float:
-        """The function of that level there."""
+        """The value there of that level's function."""
         return self.levels[-1].fun
 
     @property

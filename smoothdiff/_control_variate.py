@@ -24,7 +24,7 @@ def control_variate(
     surrogate_options: Options | None = None,
     **options: Unpack[Options],
 ) -> Callable:
-    r"""What a transform estimates, with a cheap function that is like `fun` as a control variate.
+    r"""A transform of `fun`, with a cheap function that is like it as a control variate.
 
     $$ T[f] = T[f - h] + T[h] $$
 

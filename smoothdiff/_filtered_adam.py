@@ -25,7 +25,9 @@ class FilteredAdamState(NamedTuple):
 
 
 def filter_updates(filter: Filter) -> optax.GradientTransformationExtraArgs:
-    """Filters the updates in space; keeps no state.
+    r"""Filters the updates in space; keeps no state.
+
+    $$ u \leftarrow \text{filter}(u, \theta) $$
 
     Args:
         filter: maps signal and guide to the filtered signal, see `smoothdiff.filters`.

@@ -74,6 +74,10 @@ class GaussianProcess(AbstractBaseline):
             leaves a constant and a linear function, which is ridge regression.
         ridge: the variance of what the fit cannot explain, over that of what it can.
 
+    Raises:
+        ValueError: a length or a ridge that is not positive; when it is used, `noise`, as it knows
+            its own smoothed value for Gaussian smoothing only.
+
     Example:
         >>> import jax, jax.numpy as jnp, smoothdiff as sd
         >>> f = lambda x: jnp.floor(jnp.sum(x**2))

@@ -19,6 +19,21 @@ class GreyRecord(NamedTuple):
         known: the mean over cases of the lowest loss of any render.
         misfit: of the network to the parameters that are known to be best, in the last lesson.
         model: the network after the round, with its mean weights; None in the history.
+
+    Example:
+        >>> import equinox as eqx, jax, jax.numpy as jnp, smoothdiff as sd
+        >>> pixels = jnp.linspace(0, 1, 16)
+        >>> render = lambda x: jnp.where(jnp.abs(pixels - x) < 0.2, 1.0, 0.0)
+        >>> pictures = jax.vmap(render)(jnp.linspace(0.2, 0.8, 32))
+        >>> network = eqx.nn.MLP(16, "scalar", 8, 1, key=jax.random.key(2))
+        >>> result = sd.train_grey_box(
+        ...     network, render, pictures, key=jax.random.key(0), sigma=0.2,
+        ...     max_evaluations=200, cases=8, lessons=8,
+        ... )
+        >>> result.history[0].round, result.history[-1].evaluations == result.evaluations
+        (1, True)
+
+    Source: own.
     """
 
     round: int
@@ -47,6 +62,21 @@ class GreyResult:
             "interrupted"; in an error "failed".
         history: a `GreyRecord` of each round.
         state: all of it, the renders that are kept included.
+
+    Example:
+        >>> import equinox as eqx, jax, jax.numpy as jnp, smoothdiff as sd
+        >>> pixels = jnp.linspace(0, 1, 16)
+        >>> render = lambda x: jnp.where(jnp.abs(pixels - x) < 0.2, 1.0, 0.0)
+        >>> pictures = jax.vmap(render)(jnp.linspace(0.2, 0.8, 32))
+        >>> network = eqx.nn.MLP(16, "scalar", 8, 1, key=jax.random.key(2))
+        >>> result = sd.train_grey_box(
+        ...     network, render, pictures, key=jax.random.key(0), sigma=0.2,
+        ...     max_evaluations=200, cases=8, lessons=8,
+        ... )
+        >>> result.reason, result.parameters.shape, result.evaluations <= 200
+        ('max_evaluations', (32,), True)
+
+    Source: own.
     """
 
     model: Any = dataclasses.field(repr=False)
@@ -60,7 +90,29 @@ class GreyResult:
 
 
 class GreyBoxError(RuntimeError):
-    """A training failed: `result` is what it had found, `__cause__` what a black box raised."""
+    """A training failed: `result` is what it had found, `__cause__` what a black box raised.
+
+    Args:
+        message: what failed, and what to do.
+        result: the `GreyResult` until then.
+
+    Example:
+        >>> import equinox as eqx, jax, jax.numpy as jnp, smoothdiff as sd
+        >>> def draw(x):
+        ...     raise ArithmeticError("no light")
+        >>> render = sd.black_box(draw, jax.ShapeDtypeStruct((16,), jnp.float32))
+        >>> network = eqx.nn.MLP(16, "scalar", 8, 1, key=jax.random.key(2))
+        >>> try:
+        ...     sd.train_grey_box(
+        ...         network, render, jnp.ones((32, 16)), key=jax.random.key(0), sigma=0.2,
+        ...         max_evaluations=200, cases=8, lessons=8,
+        ...     )
+        ... except sd.GreyBoxError as error:
+        ...     print(error.result.reason, error.result.evaluations)
+        failed 0
+
+    Source: own.
+    """
 
     def __init__(self, message: str, result: GreyResult):
         super().__init__(message)

@@ -19,6 +19,19 @@ class BlackBoxError(RuntimeError):
     A `smoothdiff.black_box` raises it; it is what `smoothdiff.minimise` reports in its
     `MinimiseError`. Out of a `jax.jit` of your own comes an error of JAX's, which has the same
     message in its text.
+
+    Example:
+        >>> import smoothdiff as sd
+        >>> @sd.black_box
+        ... def inverse(x):
+        ...     return 1 / int(x)
+        >>> try:
+        ...     inverse(0.0)
+        ... except sd.BlackBoxError as error:
+        ...     print("division by zero" in str(error))
+        True
+
+    Source: own.
     """
 
 

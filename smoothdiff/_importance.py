@@ -74,6 +74,9 @@ class Importance(eqx.Module):
             parameters only, which is cheaper to reason about and the derivative of another
             function for each element (FR22).
 
+    Raises:
+        ValueError: another order or another `blur`; when it is called, what `smooth` refuses.
+
     Example:
         >>> import jax, jax.numpy as jnp, smoothdiff as sd
         >>> f = lambda x: jnp.floor(jnp.sum(x))

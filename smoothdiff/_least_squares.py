@@ -65,6 +65,9 @@ class LeastSquares(AbstractBaseline):
         degree: 1 or 2.
         in_sample: fit all samples at once, whatever the sampler.
 
+    Raises:
+        ValueError: another degree; when it is used, `noise`, as for `GaussianProcess`.
+
     Example:
         >>> import jax, jax.numpy as jnp, smoothdiff as sd
         >>> f = lambda x: jnp.sum(x**2) + x[0] * x[1]

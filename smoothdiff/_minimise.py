@@ -128,6 +128,8 @@ def minimise(
         ... )
         >>> [round(float(y)) for y in result.y]
         [1, -2]
+
+    Source: own; each solver names its own.
     """
     limits = max_steps, max_evaluations, max_seconds, target
     kind = optx.AbstractMinimiser, "NewtonCG", check_number
@@ -207,6 +209,8 @@ def least_squares(
         ... )
         >>> round(float(result.y))
         20
+
+    Source: own; each solver names its own.
     """
     limits = max_steps, max_evaluations, max_seconds, target
     kind = optx.AbstractLeastSquaresSolver, "GaussNewton", check_residuals

@@ -20,6 +20,9 @@ class Noise(Protocol):
     Any object with these two methods is one, among them the distributions of
     `optax.perturbations`. Derivatives are as good as `log_prob` is smooth.
 
+    Raises:
+        TypeError: the transforms do, for a `noise` without these two methods.
+
     Example:
         >>> import jax, jax.numpy as jnp, optax, smoothdiff as sd
         >>> gumbel = optax.perturbations.Gumbel()

@@ -53,6 +53,8 @@ class Processes(concurrent.futures.Executor):
         ...     stairs = jax.vmap(f)(jnp.array([0.5, 1.5]))
         >>> stairs
         Array([0, 1], dtype=int32)
+
+    Source: own.
     """
 
     def __init__(self, workers: int | None = None):

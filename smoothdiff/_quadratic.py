@@ -21,6 +21,16 @@ class HessianOperator(lx.AbstractLinearOperator):
 
     A product reads the stored points twice and evaluates the function not at all. It is symmetric,
     and indefinite in general.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, smoothdiff as sd
+        >>> f = lambda x: x[0] ** 2 + 3 * x[0] * x[1]
+        >>> g = sd.smooth_quadratic(f, 0.5, baseline="quadratic")
+        >>> model = g(jax.random.key(0), jnp.ones(2))
+        >>> print(model.hessian.mv(jnp.array([1.0, 0.0])).round(2))
+        [2. 3.]
+
+    Source: Stochastic Gradient Estimation for Higher-order Differentiable Rendering, eq. 22.
     """
 
     batch: Batch
@@ -107,6 +117,16 @@ class QuadraticModel(eqx.Module):
         value: the smoothed value, a scalar.
         grad: the gradient, like the parameters.
         hessian: a symmetric `lineax` operator on vectors that are like the parameters.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, smoothdiff as sd
+        >>> f = lambda x: x[0] ** 2 + 3 * x[0] * x[1]
+        >>> g = sd.smooth_quadratic(f, 0.5, baseline="quadratic")
+        >>> model = g(jax.random.key(0), jnp.ones(2))
+        >>> print(f"{model.value:.2f}", model.grad.round(2))  # of f it is 4, of F 4 + 0.5²
+        4.25 [5. 3.]
+
+    Source: Stochastic Gradient Estimation for Higher-order Differentiable Rendering, eq. 17-22.
     """
 
     value: Float[Array, ""]

@@ -33,6 +33,8 @@ class Range(AbstractSpace):
         >>> roughness = sd.Range(0.01, 1.0, log=True)
         >>> [round(float(roughness.to_natural(u)), 3) for u in (0.0, 0.5, 1.0)]
         [0.01, 0.1, 1.0]
+
+    Source: own.
     """
 
     low: Numbers
@@ -139,6 +141,8 @@ class Integer(AbstractSpace):
         >>> die = sd.Integer(1, 6)
         >>> [int(die.to_natural(u)) for u in (0.0, 0.16, 0.17, 0.5, 1.0)]
         [1, 1, 2, 4, 6]
+
+    Source: own.
     """
 
     low: Numbers

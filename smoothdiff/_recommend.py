@@ -44,6 +44,14 @@ class Recommendation:
         seen: what the samples showed.
         advice: what to try.
         evaluations: of the function, for this.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, smoothdiff as sd
+        >>> advice = sd.recommend(lambda y, args: jnp.sum(y**2), jnp.ones(2), key=jax.random.key(0))
+        >>> advice.run, type(advice.solver).__name__
+        ('minimise', 'NewtonCG')
+
+    Source: own.
     """
 
     solver: Any = dataclasses.field(repr=False)

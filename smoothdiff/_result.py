@@ -43,6 +43,16 @@ class Record(NamedTuple):
         y: the iterate after the step; None in a history without iterates.
         best: the point at which the function was `fun`, which a run that is stopped returns; for
             callbacks, None in a history.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, smoothdiff as sd
+        >>> bowl = lambda y, args: jnp.sum((y - 1) ** 2)
+        >>> result = sd.minimise(bowl, jnp.zeros(2), key=jax.random.key(0), max_evaluations=30)
+        >>> first = result.history[0]
+        >>> first.step, first.fun >= result.fun
+        (1, True)
+
+    Source: own.
     """
 
     step: int
@@ -81,6 +91,15 @@ class Result:
         solver: the solver, also where none was given.
         state: its last state.
         answer: `y` as the solver sees it, in unit coordinates and within bounds.
+
+    Example:
+        >>> import jax, jax.numpy as jnp, smoothdiff as sd
+        >>> bowl = lambda y, args: jnp.sum((y - 1) ** 2)
+        >>> result = sd.minimise(bowl, jnp.zeros(2), key=jax.random.key(0), target=1e-6)
+        >>> print(result.y.round(2), result.reason)
+        [1. 1.] target
+
+    Source: own.
     """
 
     y: PyTree[Array]
@@ -173,7 +192,27 @@ def kept_residuals(result: Result) -> History | None:
 
 
 class MinimiseError(RuntimeError):
-    """A run failed: `result` is what it had found, `__cause__` what a black box raised."""
+    """A run failed: `result` is what it had found, `__cause__` what a black box raised.
+
+    Args:
+        message: what failed, and what to do.
+        result: the `Result` until then.
+
+    Example:
+        >>> import jax, numpy as np, smoothdiff as sd
+        >>> def fails(y):
+        ...     if y > 0.5:
+        ...         raise ArithmeticError("no convergence")
+        ...     return np.square(y - 1)
+        >>> box = sd.black_box(fails, 0.0)
+        >>> try:
+        ...     sd.minimise(lambda y, args: box(y), 0.0, key=jax.random.key(0))
+        ... except sd.MinimiseError as error:
+        ...     print(error.result.reason, error.result.evaluations > 0)
+        failed True
+
+    Source: own.
+    """
 
     def __init__(self, message: str, result: Result):
         super().__init__(message)

@@ -1,7 +1,6 @@
 """Where to sample: the points z at which a smoothed function is evaluated, x = theta + sigma z."""
 
 import abc
-import math
 from typing import ClassVar
 
 import equinox as eqx
@@ -20,6 +19,26 @@ class AbstractSampler(eqx.Module):
 
     Every sampler says in `gaussian` whether its points are standard normal as they are drawn. If
     not, `draw` returns their weights, and if so it returns None for them.
+
+    Raises:
+        TypeError: a subclass that does not say `gaussian`.
+
+    Example:
+        >>> from typing import ClassVar
+        >>> import jax, jax.numpy as jnp, smoothdiff as sd
+        >>> class Plain(sd.AbstractSampler):
+        ...     gaussian: ClassVar[bool] = True
+        ...     def block(self, num_samples, n):
+        ...         return 1
+        ...     def draw(self, key, start, count, num_samples, n, dtype):
+        ...         rows = start + jnp.arange(count)
+        ...         one = lambda row: jax.random.normal(jax.random.fold_in(key, row), (n,), dtype)
+        ...         return jax.vmap(one)(rows), None
+        >>> g = sd.smooth_grad(jnp.sum, 0.5, sampler=Plain(), baseline="linear", num_samples=64)
+        >>> print(g(jax.random.key(0), jnp.ones(2)).round(3))
+        [1. 1.]
+
+    Source: own.
     """
 
     gaussian: ClassVar[bool]
@@ -133,6 +152,9 @@ class Gaussian(PointSampler):
     Args:
         antithetic: draw pairs; `num_samples` counts both partners and must be even.
 
+    Raises:
+        ValueError: when points are drawn, an odd `num_samples` with `antithetic=True`.
+
     Example:
         >>> import jax, smoothdiff as sd
         >>> f = lambda x: (x > 0).astype(float)
@@ -173,6 +195,10 @@ class Sobol(PointSampler):
             94 % of the 95 % intervals of Student's t with 7 degrees of freedom hold the true
             gradient. Of 4 sets it is 96 %, for 1.4 times the error. With "gp" several sets leave
             the errors an upper bound, four times as wide or more, so one is best.
+
+    Raises:
+        ValueError: fewer than one replicate; when points are drawn, a `num_samples` that is no
+            multiple of `replicates`, or of twice that with `antithetic=True`.
 
     Example:
         >>> import jax, smoothdiff as sd
@@ -215,6 +241,10 @@ class Orthogonal(AbstractSampler):
         antithetic: mirror every point. A frame then has 2n points, else n; with fewer samples than
             that there is one partial frame.
 
+    Raises:
+        ValueError: when points are drawn, an odd `num_samples` with `antithetic=True`, or one that
+            is larger than a frame and no multiple of it.
+
     Example:
         >>> import jax, jax.numpy as jnp, smoothdiff as sd
         >>> f = lambda x: jnp.sum(x)
@@ -254,42 +284,3 @@ class Orthogonal(AbstractSampler):
         if self.antithetic and num_samples % 2:
             raise ValueError(f"{self} draws pairs: num_samples must be even, not {num_samples}")
         super().check(num_samples, n)
-
-
-class Uniform(PointSampler):
-    r"""Points uniform in a box, re-weighted to a normal distribution cut off there.
-
-    $$ z \sim \mathcal{U}[-h, h]^n, \qquad \log w = \log \mathcal{N}(z) + n \log 2h $$
-
-    Biased, as the Gaussian outside of the box is lost, and its weights vary wildly in many
-    dimensions. It is here for comparison, as it is in the papers.
-
-    Args:
-        half_width: h, in units of sigma.
-        antithetic: mirror every point.
-        quasi: quasi-random points instead of independent ones.
-
-    Example:
-        >>> import jax, smoothdiff as sd
-        >>> g = sd.smooth_grad(abs, 1.0, sampler=sd.Uniform(), num_samples=64)
-        >>> g(jax.random.key(0), 1.0).shape
-        ()
-
-    Source: Stochastic Gradient Estimation for Higher-order Differentiable Rendering, appendix J.
-    """
-
-    gaussian: ClassVar[bool] = False
-    half_width: float = eqx.field(static=True, default=3.0)
-    antithetic: bool = eqx.field(static=True, default=False)
-    quasi: bool = eqx.field(static=True, default=False)
-
-    def scrambled_sets(self) -> int:
-        return int(self.quasi)
-
-    def mirrored(self) -> bool:
-        return self.antithetic
-
-    def points(self, u, n):
-        z = self.half_width * (2 * u - 1)
-        constant = n * math.log(2 * self.half_width / math.sqrt(2 * math.pi))
-        return z, constant - jnp.sum(z * z, axis=1) / 2

@@ -18,6 +18,18 @@ class Selection(NamedTuple):
         surrogate: the candidate, as `ZeroGrads` takes it.
         errors: for each candidate, what its fit leaves of the held-out values' variance.
         stderrs: the standard errors of those.
+
+    Example:
+        >>> import jax
+        >>> from smoothdiff import surrogates
+        >>> u = jax.random.normal(jax.random.key(0), (100, 2))
+        >>> chosen = surrogates.select(
+        ...     [surrogates.Quadratic], u, u[:, 0], key=jax.random.key(1), steps=50
+        ... )
+        >>> chosen.surrogate.__name__, chosen.errors.shape
+        ('Quadratic', (1,))
+
+    Source: ZeroGrads (Fischer and Ritschel) leaves the choice to future work.
     """
 
     surrogate: Callable[..., Any]

@@ -23,7 +23,9 @@ SIGMA = 0.2
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class AbstractSpace(abc.ABC):
-    """What a parameter may be, and its unit coordinate, in which a solver searches.
+    r"""What a parameter may be, and its unit coordinate, in which a solver searches.
+
+    $$ y = t(u), \qquad u = t^{-1}(y) $$
 
     The function sees natural values, a solver sees unit ones; both have the shape of the parameter,
     whose last axes are also those of the numbers that a space is made of. Spaces are equal if
@@ -33,6 +35,26 @@ class AbstractSpace(abc.ABC):
         sigma: the smoothing width in unit coordinates, a number or one for each number of the
             parameter; by default what the subclass says.
         label: a name for plots, with the unit; or one for each number of the parameter.
+
+    Raises:
+        ValueError: a sigma that is not a positive number.
+
+    Example:
+        An area, which is searched by its side:
+
+        >>> import dataclasses
+        >>> import jax.numpy as jnp, smoothdiff as sd
+        >>> @dataclasses.dataclass(frozen=True)
+        ... class Root(sd.AbstractSpace):
+        ...     def to_unit(self, y):
+        ...         return jnp.sqrt(y)
+        ...     def to_natural(self, u):
+        ...         return jnp.square(u)
+        >>> area = Root(sigma=0.5, label="area (m²)")
+        >>> float(area.to_unit(9.0)), float(area.to_natural(2.0))
+        (3.0, 4.0)
+
+    Source: own.
     """
 
     sigma: Any = None
@@ -51,7 +73,7 @@ class AbstractSpace(abc.ABC):
 
     @abc.abstractmethod
     def to_natural(self, u: ArrayLike) -> Array:
-        """The natural value at a unit coordinate; never out of the range, by rounding neither."""
+        """The natural value at a unit coordinate; never out of the range, not even by rounding."""
 
     def to_axis(self, u: ArrayLike) -> Array:
         """Where plots show a unit coordinate: the natural value."""

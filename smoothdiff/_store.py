@@ -39,6 +39,17 @@ class Evaluation(NamedTuple):
     Attributes:
         args: its arguments.
         value: its value there.
+
+    Example:
+        >>> import tempfile, numpy as np, smoothdiff as sd
+        >>> path = tempfile.mktemp()
+        >>> f = sd.black_box(lambda x, y: np.hypot(x, y), 0.0, store=path)
+        >>> length = f(3.0, 4.0)
+        >>> (evaluation,) = sd.load_store(path)
+        >>> [float(x) for x in evaluation.args], float(evaluation.value)
+        ([3.0, 4.0], 5.0)
+
+    Source: own.
     """
 
     args: tuple

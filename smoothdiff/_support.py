@@ -111,6 +111,8 @@ def local_support(radius: int, *, ndim: int = 2) -> LocalSupport:
         >>> g = sd.smooth_grad(terms, 0.5, support=sd.local_support(0))
         >>> g(jax.random.key(0), jnp.zeros((4, 4))).shape
         (4, 4)
+
+    Source: own.
     """
     if radius < 0 or ndim < 1:
         raise ValueError(f"radius must be at least 0 and ndim at least 1: {radius}, {ndim}")
@@ -137,6 +139,8 @@ def matrix_support(matrix: Any, shape: tuple[int, ...] | None = None) -> MatrixS
         >>> support = sd.matrix_support(np.eye(3))
         >>> support(jnp.array([1.0, 2.0, 3.0]))
         Array([1., 2., 3.], dtype=float32)
+
+    Source: own.
     """
     shape = (matrix.shape[0],) if shape is None else tuple(shape)
     if math.prod(shape) != matrix.shape[0]:

@@ -33,6 +33,8 @@ class Real(AbstractSpace):
         >>> offset = sd.Real(50.0, label="offset (mm)")
         >>> float(offset.to_unit(100.0)), float(offset.to_natural(0.5))
         (2.0, 25.0)
+
+    Source: own.
     """
 
     scale: Numbers
@@ -76,6 +78,8 @@ class Positive(AbstractSpace):
         >>> density = sd.Positive(1000.0)
         >>> [round(float(density.to_natural(u))) for u in (-math.log(2), 0.0, math.log(2))]
         [500, 1000, 2000]
+
+    Source: own.
     """
 
     scale: Numbers | None = None
@@ -160,6 +164,8 @@ class Periodic(AbstractSpace):
         >>> heading = sd.Periodic(360.0, low=-180.0, label="heading (deg)")
         >>> [float(heading.to_natural(u)) for u in (0.0, 0.75, 1.0, 1.75)]
         [-180.0, 90.0, -180.0, 90.0]
+
+    Source: own.
     """
 
     period: Numbers = 2 * math.pi

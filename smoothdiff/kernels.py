@@ -38,6 +38,8 @@ def _check(order: int) -> None:
 def derivative(x: Float[Array, "..."], sigma: float | Array = 1.0, order: Order = 0) -> Array:
     r"""The Gaussian or its first or second derivative, signed.
 
+    $$ \mathcal{N}^{(k)}_\sigma(x), \qquad k = 0, 1, 2 $$
+
     Args:
         x: where, any shape, in the units of sigma.
         sigma: the width.
@@ -97,6 +99,8 @@ def log_density(x: Float[Array, "..."], sigma: float | Array = 1.0, order: Order
 
 def cdf(x: Float[Array, "..."], sigma: float | Array = 1.0, order: Order = 0) -> Array:
     r"""The distribution function of `log_density`.
+
+    $$ P_k(x) = \int_{-\infty}^x q_k(t) \, dt $$
 
     Args:
         x: where, any shape, in the units of sigma.

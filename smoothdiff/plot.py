@@ -54,6 +54,8 @@ def history(
         >>> ax = sd.plot.history(result, ax=matplotlib.figure.Figure().subplots())
         >>> ax.get_xlabel()
         'evaluations'
+
+    Source: own.
     """
     if against not in ("evaluations", "seconds"):
         raise ValueError(f'against must be "evaluations" or "seconds", not {against!r}')
@@ -144,6 +146,8 @@ def slice(
         ... )
         >>> ax.get_xlabel()
         'x (m)'
+
+    Source: own.
     """
     lines = Slices.of(fun, y, args, sigma, key, space, labels, points, num_samples)
     chosen = lines.all() if parameter is None else [lines.position(parameter)]
@@ -207,6 +211,8 @@ def errors(
         ... )
         >>> [tick.get_text() for tick in ax.get_yticklabels()]
         ['drag', 'mass']
+
+    Source: own.
     """
     if isinstance(values, Result):
         if stderrs is not None:

@@ -280,6 +280,55 @@ def test_the_command_line_writes_results_pictures_and_tables(monkeypatch, tmp_pa
         cli.main(["draw", "shadow"], tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"start": lambda seed: like(0)}, "is 0 at start 0 of 'bowl'.* Begin elsewhere"),
+        ({"loss": lambda y: bowl_loss(y) - 9}, "lowest value is -.*optimum, 0 by default"),
+        ({"loss": lambda y: bowl_loss(y) / 0}, "is inf at start"),
+        ({"loss": lambda y: bowl_loss(y) * jnp.nan}, "is nan at start"),
+    ],
+)
+def test_a_start_with_nothing_to_reduce_is_refused(tmp_path, changes, match):
+    task = changed(BOWL, **changes) if "loss" in changes else dataclasses.replace(BOWL, **changes)
+    with pytest.raises(ValueError, match=match):
+        runs_of(task, HALVING, tmp_path)
+
+
+def test_a_method_that_diverges_is_drawn(monkeypatch, tmp_path, capsys):
+    """A task without an image, and a run with no finite error but the start's."""
+
+    def diverging(problem):
+        def solve(y0, key, record):
+            for _ in range(3):
+                record(y0 + problem.loss(y0) * jnp.nan)
+
+        return solve
+
+    plain = lambda full: dataclasses.replace(build(full), score=Score(REFERENCE))
+    registered(monkeypatch, {"plain": plain}, {"diverging": diverging})
+    cli.main(["run", "plain"], tmp_path)
+    assert "Not to 90 %" in capsys.readouterr().out
+    results = json.loads((tmp_path / "plain" / "results.json").read_text())
+    found = results["tasks"]["stripes"]["methods"]["diverging"]
+    assert found["final"]["image_error"] == dict.fromkeys(("median", "lower", "upper"))
+    for picture in ("error-vs-time.png", "error-vs-evaluations.png"):
+        assert (tmp_path / "plain" / picture).read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("score", "match"),
+    [
+        (Score(), r"what is sought: Score\(reference="),
+        (Score(REFERENCE, errors=lambda y, scene: {}), "only a Descent"),
+    ],
+)
+def test_a_black_box_is_scored_as_all_are(monkeypatch, tmp_path, score, match):
+    registered(monkeypatch, {"odd": lambda full: dataclasses.replace(build(full), score=score)})
+    with pytest.raises(ValueError, match=match):
+        cli.main(["run", "odd", "--methods", "halving"], tmp_path)
+
+
 @pytest.mark.slow
 def test_a_family_shares_a_table_and_a_picture(monkeypatch, tmp_path, capsys):
     def members(full):

@@ -9,13 +9,32 @@ import jax
 import pytest
 
 import smoothdiff as sd
+from smoothdiff.renderers import mitsuba
 
 MODULES = sorted(module.name for module in pkgutil.walk_packages(sd.__path__, prefix="smoothdiff."))
 TRANSFORMS = sorted(name for name in sd.__all__ if name.startswith("smooth"))
+PLACES = (sd, sd.filters, sd.kernels, sd.plot, sd.surrogates, mitsuba)
+PUBLIC = {
+    f"{place.__name__}.{name}": thing
+    for place in PLACES
+    for name, thing in vars(place).items()
+    if name in getattr(place, "__all__", [n for n in vars(place) if n[0] != "_"])
+    and getattr(thing, "__module__", "").startswith("smoothdiff")
+}
 # modules of optional extras import what the test extra brings
 EXAMPLES = ["smoothdiff", *MODULES]
 # whole runs that take long to compile; `minimise` and `least_squares` have quicker ones
-WHOLE_RUNS = ("_solvers.", "_minimise", "_search", "_coarse", "_grey_box", "_with_cov", "plot")
+WHOLE_RUNS = (
+    "_solvers.",
+    "_minimise",
+    "_search",
+    "_coarse",
+    "_grey_",
+    "_result",
+    "_select",
+    "_with_cov",
+    "plot",
+)
 LONG = [name for name in MODULES if name.removeprefix("smoothdiff.").startswith(WHOLE_RUNS)]
 
 
@@ -30,6 +49,21 @@ def test_public_names_are_documented(name):
         for method, value in vars(thing).items():
             if callable(value) and not method.startswith("_"):
                 assert inspect.getdoc(getattr(thing, method)), f"{name}.{method}"
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_what_a_public_name_says(name):
+    """One line, then the arguments, what comes back, what is raised, an example, the source."""
+    thing = PUBLIC[name]
+    doc = inspect.getdoc(thing) or ""
+    first, blank = doc.splitlines()[:2]
+    assert first.endswith(".")
+    assert not blank
+    sections = ["Example", "Source"]
+    if inspect.isfunction(thing):
+        sections += ["Args", "Returns"] + ["Raises"] * (thing is not mitsuba.available)
+    assert [part for part in sections if f"\n{part}:" not in doc] == []
+    assert ">>> " in doc[doc.index("\nExample:") :]
 
 
 @pytest.mark.parametrize("name", TRANSFORMS)

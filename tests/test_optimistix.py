@@ -10,8 +10,10 @@ import optax
 import optimistix as optx
 import pytest
 from closed_forms import as_users_have_it
+from parts import new_ones
 
 import smoothdiff as sd
+from smoothdiff._solvers import AbstractSmoothSolver
 
 KEY = jax.random.key(0)
 START, TARGET = np.array([-1.2, 1.0], np.float32), np.array([0.6, -0.4], np.float32)
@@ -125,6 +127,17 @@ def test_what_does_not_step_as_ours_do_is_refused(minimise, solver, match):
 
 # ours under its loops
 
+# these are tested in files of their own, as they need more than sigma or do not end so near
+OTHERS = (sd.FirstOrder, sd.LocalCrossEntropy, sd.LocalGaussNewton, sd.ZeroGrads)
+NEW = new_ones(AbstractSmoothSolver, [sd.GaussNewton, sd.NewtonCG, *OTHERS], 0.3).values()
+
+
+def its_own(solver):
+    """The loop of a solver, and a function for it."""
+    if isinstance(solver, optx.AbstractMinimiser):
+        return optx.minimise, bowl, solver
+    return optx.least_squares, valley, solver
+
 
 @pytest.mark.parametrize(
     ("run", "fun", "solver"),
@@ -132,6 +145,7 @@ def test_what_does_not_step_as_ours_do_is_refused(minimise, solver, match):
         pytest.param(optx.minimise, bowl, sd.NewtonCG(0.3), marks=pytest.mark.slow),
         pytest.param(optx.minimise, squares, sd.NewtonCG(0.3), marks=pytest.mark.slow),
         (optx.least_squares, valley, sd.GaussNewton(0.3)),
+        *map(its_own, NEW),
     ],
 )
 def test_with_defaults_they_end_by_themselves(run, fun, solver):

@@ -10,6 +10,7 @@ import numpy as np
 import optax
 import pytest
 from closed_forms import assert_unbiased, boxes, half_space, keys
+from parts import new_ones
 from scipy import integrate, stats
 
 import smoothdiff as sd
@@ -39,10 +40,12 @@ WEIGHTED = {
     "uniform": (sd.Uniform(), 7),
     "uniform, quasi pairs": (sd.Uniform(antithetic=True, quasi=True), 8),
 }
-ALL = {**NORMAL, **WEIGHTED, "noise": (as_sampler(None, GUMBEL), 7)}
+KNOWN = {**NORMAL, **WEIGHTED, "noise": (as_sampler(None, GUMBEL), 7)}
+NEW = new_ones(sd.AbstractSampler, [type(sampler) for sampler, _ in KNOWN.values()])
+ALL = KNOWN | {name: (sampler, 12) for name, sampler in NEW.items()}
 # every sampler, alone and in pairs, independent and scrambled
 ADDRESSED = ("gaussian", "pairs", "sobol pairs", "sobol replicates", "frames", "frames of pairs")
-ADDRESSED += ("aggregate 1", "aggregate, quasi", "uniform", "uniform, quasi pairs", "noise")
+ADDRESSED += ("aggregate 1", "aggregate, quasi", "uniform", "uniform, quasi pairs", "noise", *NEW)
 
 
 def draw(sampler, num_samples, n, many=None, dtype=jnp.float32):

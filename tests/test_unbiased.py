@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from closed_forms import Several, assert_unbiased, half_space, keys, smoothed_half_space
+from parts import new_ones
 
 import smoothdiff as sd
 
@@ -66,9 +67,9 @@ SAMPLERS = {
     "aggregate 1": sd.Aggregate(1),
     "aggregate 2, quasi": sd.Aggregate(2, antithetic=False, quasi=True),
 }
+# a new one, with its defaults; Uniform is biased, as it says
+NEW = new_ones(sd.AbstractSampler, [sd.Uniform, *map(type, SAMPLERS.values())])
 FITS = ("linear", "quadratic", "gp")
-# one scrambled set is fitted as a whole, which is biased
-WHOLE = ("sobol", "aggregate 2, quasi")
 # how many keys for so many samples, and the standard errors that they must reach
 PRECISION = {
     2: (4096, 0.15),
@@ -78,8 +79,11 @@ PRECISION = {
     64: (1024, 0.06),
 }
 # 24 are enough for a full quadratic fit of pairs; two are one group of pairs, of frames
-QUICK = [(name, 24) for name in list(SAMPLERS)[::3]]
+QUICK = [(name, 24) for name in [*list(SAMPLERS)[::3], *NEW]]
 QUICK += [(name, 2) for name in ("gaussian", "frames of pairs", "replicates", "aggregate 2, quasi")]
+SAMPLERS |= NEW
+# one set that is even as a whole is fitted as a whole, which is biased
+WHOLE = [name for name, sampler in SAMPLERS.items() if sampler.group(64, 2) == 64]
 FITTED = [
     case if case in QUICK else pytest.param(*case, marks=pytest.mark.slow)
     for case in itertools.product(SAMPLERS, PRECISION)

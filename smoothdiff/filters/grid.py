@@ -109,7 +109,12 @@ def cross_bilateral(
 def bilateral(
     sigma_d: Scale, levels: int, *, ndim: int, sigma_s: Scale = 1.0, log: bool = True
 ) -> Filter:
-    """A filter that the edges of the signal itself stop; it ignores the guide.
+    r"""A filter that the edges of the signal itself stop; it ignores the guide.
+
+    $$ h(x) \leftarrow \frac{\sum_o w_o \, h(x + 2^l o)}{\sum_o w_o}, \quad
+       w_o = e^{-\|o\| / \sigma_s} \, e^{-\|s(x + 2^l o) - s(x)\| / \sigma_d} $$
+
+    with the signal s as it is given, where h begins.
 
     It is for comparison, since gradients are noisier than the parameters that they are gradients
     of. The moments of Adam get weights of their own from it, so that steps may be large.

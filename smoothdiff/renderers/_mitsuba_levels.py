@@ -65,6 +65,8 @@ def levels(
         >>> steps = mitsuba.levels(scene, "ball.translate", photo, spp=16)
         >>> [level.cost for level in steps]
         [1024.0, 1024.0, 16384.0]
+
+    Source: own, as `coarse_to_fine`.
     """
     photo = np.asarray(photo, np.float32)
     if photo.ndim != 3 or photo.shape[2] != 3:

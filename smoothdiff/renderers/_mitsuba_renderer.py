@@ -95,6 +95,8 @@ def renderer(
         Array([0., 0., 0.], dtype=float32)
         >>> jax.jit(render)(jax.numpy.array([0.0, 0.0, 5.0])).shape
         (8, 8, 3)
+
+    Source: own; the renderer is Mitsuba 3 (Jakob et al., 2022).
     """
     names = (params,) if isinstance(params, str) else tuple(params)
     if not names or len(set(names)) < len(names):
@@ -154,6 +156,19 @@ class Renderer:
 
     Attributes:
         initial: The parameters that the scene came with, in the form that the function takes.
+
+    Raises:
+        ValueError: when it is called, parameters of other names or shapes.
+
+    Example:
+        >>> from smoothdiff.renderers import mitsuba
+        >>> scene = {"type": "scene", "ball": {"type": "sphere"}, "sky": {"type": "constant"},
+        ...          "camera": {"type": "perspective"}}
+        >>> render = mitsuba.renderer(scene, ["ball.scale"], resolution=8, integrator="direct")
+        >>> render(render.initial).shape
+        (8, 8, 3)
+
+    Source: own; the renderer is Mitsuba 3 (Jakob et al., 2022).
     """
 
     initial: Array | dict[str, Array]

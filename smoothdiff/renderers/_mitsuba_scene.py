@@ -54,6 +54,8 @@ def available(variant: str) -> bool:
         >>> from smoothdiff.renderers import mitsuba
         >>> mitsuba.available("scalar_rgb")
         True
+
+    Source: own; the renderer is Mitsuba 3 (Jakob et al., 2022).
     """
     if variant.startswith("llvm"):
         # Loading an old LLVM is harmless, compiling with it is not: ask only for its version.
