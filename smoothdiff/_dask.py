@@ -22,8 +22,9 @@ from smoothdiff._processes import Seconds
 
 # bytes of an array that the workers get once and not with each call, and how many they keep
 _LARGE, _KEPT = 1_000_000, 8
-# seconds without a worker after which that is said, and between two looks at a cluster
-_LONELY, _GLANCE = 60.0, 2.0
+# seconds without a worker after which that is said, between two looks at a cluster, and between two
+# while it is told something
+_LONELY, _GLANCE, _MOMENT = 60.0, 2.0, 0.01
 
 
 _log = logging.getLogger("smoothdiff")
@@ -135,6 +136,10 @@ class OnDask(AtOnce):
         future.cancel()
         if not workers:  # and to name none would name all
             return
+        # killed before the scheduler knows of that, the worker would hand the call to another one
+        end = time.monotonic() + _GLANCE
+        while self._workers(future) and time.monotonic() < end:
+            time.sleep(_MOMENT)
         kill = lambda dask_worker: os.kill(dask_worker.pid, signal.SIGKILL)
         if not self._client.run(kill, workers=workers, nanny=True, on_error="ignore"):
             self._raise_if_all_hang()
