@@ -4,7 +4,6 @@ from smoothdiff import filters, kernels, plot, surrogates
 from smoothdiff._aggregate import Aggregate
 from smoothdiff._baselines import AbstractBaseline
 from smoothdiff._black_box import black_box
-from smoothdiff._box import Uniform
 from smoothdiff._call import Options
 from smoothdiff._check_gradient import GradientCheck, check_gradient
 from smoothdiff._coarse_to_fine import CoarseToFine, Level, coarse_to_fine
@@ -41,6 +40,7 @@ from smoothdiff._spaces import AbstractSpace
 from smoothdiff._store import Evaluation, load_store
 from smoothdiff._support import local_support, matrix_support, moving_support, probe_support
 from smoothdiff._unbounded import Periodic, Positive, Real
+from smoothdiff._uniform_sampler import Uniform
 from smoothdiff._with_covariance import with_covariance
 
 __version__ = "0.2.0"

@@ -42,7 +42,7 @@ class Evaluation(NamedTuple):
 
     Example:
         >>> import tempfile, numpy as np, smoothdiff as sd
-        >>> path = tempfile.mktemp()
+        >>> path = tempfile.mkdtemp() + "/lengths.db"
         >>> f = sd.black_box(lambda x, y: np.hypot(x, y), 0.0, store=path)
         >>> length = f(3.0, 4.0)
         >>> (evaluation,) = sd.load_store(path)

@@ -14,6 +14,8 @@ import pytest
 from closed_forms import as_users_have_it
 
 import smoothdiff as sd
+from smoothdiff._executors import AtOnce
+from smoothdiff._host_samples import Samples
 
 FAULTS = {
     1: "raised ValueError: negative roughness",
@@ -101,6 +103,27 @@ def test_a_broken_pool_of_others_names_the_calls_that_may_have_done_it():
         with pytest.raises(sd.BlackBoxError, match=r"sd\.Processes\(4\) replaces") as info:
             jax.vmap(f)(jnp.array([2.0, 0.25]))
     assert "fault(array(2., dtype=float32))" in str(info.value)
+
+
+def test_the_clock_starts_anew_where_a_call_changes_its_worker():
+    release, places = threading.Event(), iter(range(20))
+
+    class Moving(AtOnce):
+        """Threads, of which each look at a call seems to find another one."""
+
+        glances_every = 0.1
+
+        def _place(self, future):
+            if (place := next(places)) == 5:
+                release.set()
+            return place
+
+    samples = Samples([np.array([2.0])], [0], jax.tree.structure((0,)))
+    host = lambda x: release.wait(20) and x
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        late = lambda sample, value: None
+        (outcome,) = Moving(pool).outcomes(host, samples, [0], retries=0, timeout=0.3, late=late)
+    assert (outcome.value, outcome.error) == (2.0, None)
 
 
 @pytest.mark.parametrize("executor", [None, "threads"])
