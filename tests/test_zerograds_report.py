@@ -47,7 +47,8 @@ def slope(full: bool = False) -> Task:
         budget=Budget(400, 100.0),
     )
     start = lambda seed: jnp.asarray([1.0, 1.0])
-    return Task("slope", "A slope", problem, Score(jnp.zeros(2)), start, seeds=1)
+    score = Score(jnp.asarray([-50.0, 50.0]), optimum=-350.0)
+    return Task("slope", "A slope", problem, score, start, seeds=1)
 
 
 TASK = {"parameters": 3, "evaluations": [10, 20, 40]}
