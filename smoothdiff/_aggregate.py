@@ -25,16 +25,16 @@ class Aggregate(PointSampler):
        \frac{q_2}{p} = \frac{1}{n^2} \Big( \sum_i \tfrac{\sqrt{2 \pi e}}{4} |z_i^2 - 1|
        + \sum_{i \ne j} \tfrac{\pi}{2} |z_i z_j| \Big), $$
 
-    mixed with a share of the plain Gaussian, without which the weights of the value, and under
-    order 2 of the gradient, have infinite variance in one dimension.
+    A share of the plain Gaussian is mixed in. Without it the weights of the value have infinite
+    variance in one dimension, and under order 2 those of the gradient too.
 
     Args:
         order: 1 for gradients, 2 for Hessians and their products.
         antithetic: mirror every point, as in the paper.
-        quasi: quasi-random points instead of independent ones. As one set is re-weighted as a
-            whole, baseline="mean" is then biased by O(1/N): the gradient of a step in one dimension
-            under order 2 by -8 % at N = 8, -2 % at 24 and -0.6 % at 64. With "none" it is not.
-        share: of the plain Gaussian; 0 is the sampler as published.
+        quasi: quasi-random points instead of independent ones. One set is re-weighted as a whole,
+            so baseline="mean" is biased by O(1/N), and "none" is not. The gradient of a step in one
+            dimension under order 2 is off by -8 % at N = 8, -2 % at 24 and -0.6 % at 64.
+        share: the share of the plain Gaussian; 0 is the sampler as published.
 
     Raises:
         ValueError: another order, a share that is none; when points are drawn, an odd `num_samples`

@@ -26,36 +26,35 @@ from smoothdiff._support import as_support
 class Options(TypedDict, total=False):
     """What every transform takes beside the function and sigma, by keyword.
 
-    The defaults, which the signature of each transform shows, are the same for all, so that they
-    agree with AD of `smooth` at the same key: scrambled points and an interpolation of them are the
-    most accurate for gradients, Hessians and products alike wherever `python -m benchmarks
-    variance` looks.
+    All transforms have the same defaults, which their signatures show. So they agree with AD of
+    `smooth` at the same key. Scrambled points and an interpolation of them are the most accurate
+    choice for gradients, Hessians and products wherever `python -m benchmarks variance` looks.
 
     Args:
         argnums: which of the function's arguments to smooth and differentiate, an int or a tuple.
         num_samples: evaluations of the function in one call, all included.
         sampler: where to sample, a sampler object such as `Gaussian(antithetic=True)`; by default
             `Sobol()`.
-        noise: what smooths in place of the Gaussian, an object with `sample` and `log_prob`, see
-            `Noise`. It draws its points itself, so there is no sampler then.
-        baseline: what to subtract: "none", "mean" (of the other samples), "center" (f(theta), one
-            evaluation), "linear", "quadratic" or "gp" (fitted), "ad" (the linear function with the
-            slope that AD sees at theta, one evaluation with its gradient: for losses in which AD
-            lacks only the moving edges), "auto" ("gp" where it gains, else "mean"), or a baseline
-            object.
-        support: for a function that returns an array of terms whose sum is the objective: a linear
-            map from parameter-shaped to term-shaped arrays with entries 0 and 1 that says which
-            terms a parameter may influence. See `local_support`.
+        noise: what smooths in place of the Gaussian: an object with `sample` and `log_prob`, see
+            `Noise`. It draws its points itself, so leave the sampler out.
+        baseline: what to subtract. "none"; "mean" of the other samples; "center", which is f(theta)
+            and takes one evaluation; a fit, "linear", "quadratic" or "gp"; "ad", the linear
+            function with the slope that AD sees at theta, for losses in which AD lacks only the
+            moving edges (one evaluation, with its gradient); "auto", which is "gp" where it gains
+            and else "mean"; or a baseline object.
+        support: which terms a parameter may influence, for a function that returns an array of
+            terms whose sum is the objective. A linear map with entries 0 and 1, from
+            parameter-shaped to term-shaped arrays. See `local_support`.
         bounds: a pair (low, high), each a number or a pytree like the parameters. The function
             sees points clamped to them; the weights see the points as drawn.
         batch_size: evaluate and differentiate at most so many samples at a time, which bounds the
             memory. The estimate is the same but for rounding.
-        sharding: devices that share out the samples: a `jax.sharding.Mesh` of one axis, or a
-            `NamedSharding` of one axis of a larger mesh. Each evaluates and keeps its part of them,
-            under `jax.jit`, and the sums over samples are combined. The same key gives the same
+        sharding: devices that share the samples: a `jax.sharding.Mesh` of one axis, or a
+            `NamedSharding` of one axis of a larger mesh. Under `jax.jit` each device evaluates and
+            keeps its part, and the sums over samples are combined. The same key gives the same
             estimate on any number of devices, but for rounding. On several hosts, call
             `jax.distributed.initialize()` first and make the mesh of `jax.devices()`; every process
-            then runs the same program. Not for a `black_box`, whose calls an `executor` shares out.
+            then runs the same program. Not for a `black_box`: there an `executor` shares the calls.
         nonfinite: "propagate" a NaN or infinite sample into the estimate, or "drop" it and
             re-weight the others; NaN if fewer than half are left.
         has_aux: the function returns (value, aux); aux comes back with one row per sample.

@@ -103,15 +103,15 @@ def check_gradient(
     have noise and jumps. Both sides are estimated from the same pairs of points, and an interval of
     their difference decides: for each entry the gradient is right, wrong, or undecided.
 
-    All intervals together hold with probability 1 - `level`. A linear fit to the other half
-    of the samples is taken off, so that a function that is all but linear needs few of them.
+    All intervals together hold with probability 1 - `level`. From each half of the samples a linear
+    fit to the other half is subtracted, so a nearly linear function needs few samples.
 
-    Both functions are called at one point after the other, outside of JAX's transforms: they may be
-    compiled by `jax.jit`, and may be any Python functions.
+    Both functions are called point by point, outside of JAX's transforms. So they may be compiled
+    by `jax.jit`, and may be any Python functions.
 
     Args:
-        grad_fun: y -> what is to be checked, a pytree like y: AD's, a renderer's own or one that is
-            written by hand.
+        grad_fun: y -> the gradient to check, a pytree like y: from AD, from a renderer, or written
+            by hand.
         fun: y -> a number.
         y: where to check, a pytree of numbers and arrays.
         sigma: how far around y to look, in the units of the parameters: a number or a pytree like

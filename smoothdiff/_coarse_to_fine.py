@@ -53,7 +53,7 @@ class CoarseToFine:
 
     Attributes:
         levels: the result of each level that was reached, the coarsest first.
-        cost: of all evaluations, in those of the finest level.
+        cost: what all evaluations cost together, in evaluations of the finest level.
 
     Example:
         >>> import jax, jax.numpy as jnp, smoothdiff as sd
@@ -113,13 +113,15 @@ def coarse_to_fine(
        \sigma_k = \sigma_{k-1} \sqrt{c_{k-1} / c_k} $$
 
     Far from the answer a cheap version says as much as a dear one, and a picture of few pixels has
-    fewer local minima. A level is left where it has little more to tell: when the lowest value
-    falls by less than a tenth within so many evaluations as pay for the n + 1 that the next level
-    begins with, at least 2 (n + 1) and at most 20 (n + 1). The next one begins at the best point.
-    Its sigma is smaller, as the error of a level is: both the width of a pixel and the noise of
-    random samples fall with the root of what they cost. The finest level ends as any search does.
+    fewer local minima. The search leaves a level that has little more to tell: one whose lowest
+    value has fallen by less than a tenth during its last evaluations, as many as cost what the
+    first n + 1 of the next level do (at least 2 (n + 1), at most 20 (n + 1)). The next level begins
+    at the best point. Its sigma is smaller, because its error is: the width of a pixel and the
+    noise of random samples both fall with the root of their cost. The finest level ends as any
+    search does.
 
-    If the finest function is lower at `y0` than what it found, it searches once more from there.
+    If `y0` has a lower value than the answer, by the finest level, that level is searched once more
+    from `y0`.
 
     Args:
         minimiser: `minimise` or `least_squares`.
@@ -129,11 +131,11 @@ def coarse_to_fine(
         args: passed on to the functions.
         key: a random key.
         target: a value of the finest level that is good enough.
-        max_cost: what all evaluations may cost, in evaluations of the finest level.
+        max_cost: the most that all evaluations may cost, in evaluations of the finest level.
         max_seconds: seconds after which no further step begins.
-        callback: called with each step's `Record`; all ends if it returns something true.
-        **options: as for the minimiser: `bounds`, `space`, `sigma`, `solver`, `progress`. A solver
-            is for the coarsest level.
+        callback: called with each step's `Record`; the search ends if it returns something true.
+        **options: as for the minimiser: `bounds`, `space`, `sigma`, `solver`, `progress`. Sigma and
+            a solver are for the coarsest level.
 
     Returns:
         A `CoarseToFine`.

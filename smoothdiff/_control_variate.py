@@ -28,17 +28,17 @@ def control_variate(
 
     $$ T[f] = T[f - h] + T[h] $$
 
-    All transforms T are linear in the function. f - h needs few samples where h is near f. h needs
-    many samples, and none of f. Both parts are unbiased for any h if their sampler and baseline
+    All transforms T are linear in the function. T[f - h] needs few samples where h is near f. T[h]
+    needs many samples, but none of f. Both are unbiased for any h if their sampler and baseline
     are, so a bad surrogate costs accuracy and makes no bias. The baseline is applied to f - h.
 
     Args:
         transform: `smooth`, `smooth_grad`, `smooth_value_and_grad`, `smooth_jacobian`,
             `smooth_hessian` or `smooth_hvp`.
         fun: the function that is expensive.
-        surrogate: called with the same arguments, gives an output like that of `fun`: what
-            `ZeroGrads.learnt` returns, a coarser picture, a model of an earlier design. It must
-            not depend on the key of this call, nor on samples that are drawn with it.
+        surrogate: h, the cheap function. It takes the same arguments, and its output is like that
+            of `fun`: what `ZeroGrads.learnt` returns, a coarser picture, a model of an earlier
+            design. It must not depend on the key of this call, nor on samples drawn with it.
         sigma: as for `smooth`.
         surrogate_options: what the second part has in place of 4,096 points in eight scrambled
             sets and the baseline "mean". With `{"baseline": "quadratic"}` it is exact to rounding

@@ -35,13 +35,17 @@ class Slopes(NamedTuple):
     """What a regression tells of the slopes of the residuals.
 
     `squares` is the sum over residuals of their slopes' products, and `noise` and `curved` what the
-    two parts of the errors add to it. `scale` is the unit of each parameter.
+    two parts of the errors add to it. `scale` is the unit of each parameter. `even` is the square
+    of the distance at which both parts are the same, that of parameters in their units or, if
+    `of_residuals`, that of residuals.
     """
 
     squares: Float[np.ndarray, "n n"]
     noise: Float[np.ndarray, "n n"]
     curved: Float[np.ndarray, "n n"]
     scale: Float[np.ndarray, " n"]
+    even: float
+    of_residuals: bool
 
 
 class Covariance(NamedTuple):
@@ -72,9 +76,9 @@ def slopes(
     # no value is known better than to its last digit
     rounding = np.finfo(rows.dtype).eps ** 2 * np.mean(rows[here].astype(float) ** 2)
     least = max(rounding, np.finfo(float).tiny)
-    best, found = -np.inf, None
+    best, found, even = -np.inf, None, (np.inf, False)
     # curvature grows with the distance, by sigma or by what the residuals say
-    for distances in (np.sum(away**2, axis=1), np.diag(gram)):
+    for of_residuals, distances in ((False, np.sum(away**2, axis=1)), (True, np.diag(gram))):
         some = np.log(distances[distances > 0])
         if not len(some):
             continue
@@ -82,14 +86,22 @@ def slopes(
             curved = (distances / np.exp(log)) ** 2
             likelihood, fit = _regression(gram, away, curved, size, least)
             if likelihood > best:
-                best, found = likelihood, fit
+                best, found, even = likelihood, fit, (np.exp(log), of_residuals)
     if found is None:
         return None
     squares, noise, curved = (np.zeros((len(scale), len(scale))) for _ in found)
     inside = np.ix_(moved, moved)
     squares[inside], noise[inside], curved[inside] = found
     noise[~moved, ~moved] = 1
-    return Slopes(squares, noise, curved, scale)
+    return Slopes(squares, noise, curved, scale, *even)
+
+
+def balance(known: Slopes, values: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+    """How far both parts of the errors are the same: there a slope is known best.
+
+    In directions of unit length with these sums of squared slopes.
+    """
+    return np.sqrt(known.even / values if known.of_residuals else np.full_like(values, known.even))
 
 
 def _regression(

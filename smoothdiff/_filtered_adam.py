@@ -73,14 +73,14 @@ def scale_by_filtered_adam(
        v \leftarrow \beta_2 v + (1 - \beta_2) g^2, \quad
        update = \frac{post(m) / (1 - \beta_1^t)}{\sqrt{post(v) / (1 - \beta_2^t)} + \epsilon} $$
 
-    The parameters guide both filters. With the same weights for m and v, |post(m)| / sqrt(post(v))
-    is at most the largest |m| / sqrt(v): steps are as bounded as those of Adam, to which it comes
-    down without filters.
+    The parameters guide both filters. Both moments get the same weights, so |post(m)| /
+    sqrt(post(v)) is at most the largest |m| / sqrt(v): steps are as bounded as Adam's. Without
+    filters it is Adam.
 
     Args:
-        b1: how much of the first moment stays in a step. The paper has 0.2 to 0.5 on grids.
-        b2: how much of the second moment stays; the paper has 1 - b1 = sqrt(1 - b2) on grids. A
-            moment whose number is 0 (not an array) takes no memory.
+        b1: how much of the first moment a step keeps. On grids the paper has 0.2 to 0.5.
+        b2: how much of the second moment a step keeps. On grids the paper has 1 - b1 =
+            sqrt(1 - b2). With b1 or b2 the number 0 (not an array), that moment takes no memory.
         eps: keeps the quotient finite.
         prefilter: filters the gradient.
         postfilter: filters the moments.

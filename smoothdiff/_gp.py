@@ -61,18 +61,21 @@ class GPControl(Control):
 class GaussianProcess(AbstractBaseline):
     r"""Subtracts a Gaussian-process regression of the function on the samples: baseline="gp".
 
-    For independent samples the fit that is subtracted from a sample leaves that sample out, in
-    closed form, so the estimate is unbiased; where there are no others nothing is subtracted. A
-    single scrambled point set is fitted as a whole, which is far more accurate there and biased:
-    the gradient of a step in three dimensions by -0.5 % at N = 64 and -0.2 % at 256, that of a
-    cubic by -7 % and -2 %, which is more than half of its error. It costs about $N^3$ operations
-    and an N x N matrix, so use it up to a few thousand samples, where an evaluation is what costs:
-    for a gradient in ten dimensions, more than 5 microseconds at N = 256, 33 at 1,024.
+    With independent samples each sample is left out of its own fit, in closed form. So the estimate
+    is unbiased. Where there are no other samples nothing is subtracted.
+
+    A single scrambled point set is fitted as a whole. That is far more accurate, and biased. In
+    three dimensions the gradient of a step is off by -0.5 % at N = 64 and -0.2 % at 256, that of a
+    cubic by -7 % and -2 %, which is more than half of its error.
+
+    It takes about $N^3$ operations and an N x N matrix. Use it with up to a few thousand samples,
+    and where evaluations are what costs: for a gradient in ten dimensions, if one takes more than 5
+    microseconds at N = 256, or 33 at 1,024.
 
     Args:
-        length: the length scale of the kernel in units of sigma and of the square root of n; None
-            leaves a constant and a linear function, which is ridge regression.
-        ridge: the variance of what the fit cannot explain, over that of what it can.
+        length: the length scale of the kernel, in units of sigma times the square root of n. With
+            None there is only a constant and a linear function: ridge regression.
+        ridge: the variance that the fit cannot explain, over the variance that it can.
 
     Raises:
         ValueError: a length or a ridge that is not positive; when it is used, `noise`, as it knows

@@ -42,60 +42,64 @@ def train_grey_box(
     progress: bool = False,
     checkpoint: str | os.PathLike | None = None,
 ) -> GreyResult:
-    r"""Trains a network to say what to render for a picture, without labels, by a black box.
+    r"""Trains a network that says what to render for a picture, through a black box, no labels.
 
     $$ \min_\phi \frac1C \sum_c \| R(g_\phi(I_c)) - I_c \|^2, \qquad
        x_c \approx \arg\min_x \| R(x) - I_c \|^2, \qquad
        \phi \approx \arg\min_\phi \sum_i h(g_\phi(R(x_i)) - x_i) $$
 
-    AD knows the network g and nothing of the renderer R. So the two are split: for each picture a
-    search by Gauss-Newton finds the parameters x of the renderer, and the network learns, by AD and
-    without a render, to answer what is known to be best. As a render is a picture whose parameters
-    are known, it also learns from all renders within the range of those; h is Huber's loss. Every
-    render is compared with the pictures of all cases, so that none stays in a wrong valley, and a
-    search goes on from the network's answer where that is nearer.
+    A case is a picture I. AD can differentiate the network g, and not the renderer R. So the
+    problem is split in two:
+
+    - **Search.** For each case a Gauss-Newton search looks for the parameters x whose render is
+      most like the picture. Each render is compared with the pictures of all cases, so that no case
+      stays in a wrong valley. Where the network's answer is nearer, the search goes on from there.
+    - **Lessons.** The network learns by AD, without a render, to answer the best parameters that
+      are known. A render is a picture whose parameters are known, so it learns from renders too:
+      from all whose parameters are within the range of the best ones. h is Huber's loss.
 
     The renders of the searches soon look like the pictures themselves. So half of all renders are
-    of new parameters, from a kernel density estimate of those that are known to be best: then the
-    network learns from as many different pictures as there were renders, and is better on others.
-
-    A round gives some cases a step each, and then the network its lessons.
+    of new parameters, drawn from a kernel density estimate of the best ones. The network then sees
+    as many different pictures as there are renders, and does better on pictures that it has not
+    seen. In each round some cases take a step, and then the network gets its lessons.
 
     Args:
-        model: the network, any pytree with arrays of floating-point numbers, such as a module of
-            equinox: `model(picture)` gives the parameters of the renderer, an array or a pytree.
-            It stays as it is; the trained one is in the result.
+        model: the network: `model(picture)` gives the parameters of the renderer, an array or a
+            pytree. Any pytree with arrays of floating-point numbers, such as a module of equinox.
+            It is not changed; the trained one is in the result.
         render: the renderer, from these parameters to a picture, a JAX function or a `black_box`.
             Renders that are NaN or infinite are left out.
-        pictures: what it is to be trained on, an array whose first axis counts the cases; each is
-            like a render.
+        pictures: the training pictures, an array whose first axis counts the cases; each has the
+            shape of a render.
         key: a random key; the same key gives the same training.
-        sigma: how far from an answer to look, in the units of the parameters. A number or a pytree
+        sigma: how far from an answer to look, in the units of the parameters: a number or a pytree
             like them.
-        max_evaluations: renders that are never exceeded. Lessons are planned for that many.
+        max_evaluations: the most renders, never exceeded. Lessons are planned for that many.
         optim: an optax transformation. By default Adam, whose rate falls from 3e-3 to 6e-5 over the
             lessons.
-        lessons: steps of it in a round of 64 pictures each, in the mean: an eighth of these at the
-            beginning, as there is little to learn yet, and twice as many at the end.
-        cases: so many take a step in a round.
-        kept: renders to remember, the last ones, with their pictures. With 0 there are no new
-            parameters, and a case learns from its own renders alone: for pictures that no render
-            looks like.
-        new_parameters: whether half of all renders are of new parameters. They cost as many renders
-            and no search gains from them; without them the network learns from fewer pictures.
-        target: a mean loss of the network's answers that is good enough, in the cases of a round.
+        lessons: updates of the network in a round, each on 64 pictures, on average over the rounds:
+            an eighth of these in the first, where there is little to learn yet, and twice as many
+            in the last.
+        cases: how many cases take a step in a round.
+        kept: how many of the last renders to remember, with their pictures. With 0 there are no new
+            parameters, and a case learns from its own renders alone. That is for pictures which no
+            render looks like.
+        new_parameters: whether half of all renders are of new parameters. These renders teach the
+            network alone; the searches gain nothing from them.
+        target: a loss that is good enough: the mean over the cases of a round, of the network's
+            answers.
         max_seconds: seconds after which no further round begins.
         callback: called with each round's `GreyRecord`; the training stops if it returns something
             true.
         progress: show a progress bar.
-        checkpoint: a file that keeps the training. The same call takes it up and ends with the same
-            network as without an interruption; with a larger `max_evaluations` it goes on.
+        checkpoint: a file that keeps the training. The same call continues it, and ends with the
+            same network as without an interruption. With a larger `max_evaluations` it goes on.
 
     Returns:
         A `GreyResult`. Ctrl-C ends the training and returns what there is.
 
     Raises:
-        GreyBoxError: a black box failed. Its `result` has what was found, the checkpoint is
+        GreyBoxError: a black box failed. Its `result` has what was found, and the checkpoint is
             written.
         TypeError, ValueError: an argument that cannot work; a checkpoint of another problem.
 

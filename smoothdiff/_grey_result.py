@@ -13,12 +13,12 @@ class GreyRecord(NamedTuple):
         round: which round, from 1.
         evaluations: renders so far.
         seconds: time since the start, compilation included; a resumed run counts on.
-        fun: the loss of the network's answers, the mean over the cases of this round: squared
-            differences between what was rendered of them and the pictures. Of the network as it was
-            before this round's lessons.
-        known: the mean over cases of the lowest loss of any render.
-        misfit: of the network to the parameters that are known to be best, in the last lesson.
-        model: the network after the round, with its mean weights; None in the history.
+        fun: the loss of the network's answers: the mean squared difference between their renders
+            and the pictures, over the cases of this round. The network is that of before this
+            round's lessons.
+        known: the lowest loss of any render, averaged over all cases.
+        misfit: Huber's loss of the network's answers to the best parameters, in the last lesson.
+        model: the network after the round, with averaged weights; None in the history.
 
     Example:
         >>> import smoothdiff as sd
@@ -43,14 +43,14 @@ class GreyResult:
     """What `train_grey_box` found.
 
     Attributes:
-        model: the network, with the mean of late weights.
-        parameters: the best that was rendered of each case, what the network is to answer: its
-            output with the cases as the first axis of each leaf.
-        losses: the mean squared difference of that render to the case's picture; infinite of a
-            case that had no turn.
+        model: the trained network; its weights are averaged over the late lessons.
+        parameters: for each case, the parameters of the best render, which the network is to
+            answer. Like its output, with the cases as the first axis of each leaf.
+        losses: for each case, the mean squared difference between that render and the picture;
+            infinite if the case had no turn.
         fun: the loss of the network's answers in the last round, as in its `GreyRecord`; NaN before
             the first one.
-        evaluations: renders.
+        evaluations: how many renders were made.
         reason: why the training stopped: "target", "max_evaluations", "max_seconds", "callback" or
             "interrupted"; in an error "failed".
         history: a `GreyRecord` of each round.

@@ -71,8 +71,7 @@ class Importance(eqx.Module):
         antithetic: mirror every point, as in the paper.
         quasi: quasi-random points instead of independent ones.
         blur: "all" smooths over all parameters. "own" smooths each derivative over its own
-            parameters only, which is cheaper to reason about and the derivative of another
-            function for each element (FR22).
+            parameters only, as FR22 does. Each element is then the derivative of another function.
 
     Raises:
         ValueError: another order or another `blur`; when it is called, what `smooth` refuses.
@@ -167,14 +166,13 @@ def difference_hvp(
     $$ H v \approx \frac{\nabla F(\theta + \varepsilon v) - \nabla F(\theta - \varepsilon v)}
        {2 \varepsilon} $$
 
-    The paper prints the opposite sign. With the kernels on shared evaluations use `smooth_hvp`,
-    which is this in the limit of a small step. Here the gradients are evaluated at both points,
-    with common random numbers or, as the paper's code does it, with independent ones. For
-    comparison.
+    For comparison with the papers. `smooth_hvp` is its limit for a small step, from half of the
+    evaluations. Here the gradient is estimated at both points, with common random numbers or, as in
+    the paper's code, with independent ones. The paper prints the opposite sign.
 
     Args:
-        grad: `g(key, x, *args)`, a transform's gradient.
-        step: epsilon, in units of v.
+        grad: `g(key, x, *args)`, a gradient such as `smooth_grad` makes.
+        step: ε, in units of v.
         shared: whether both gradients see the same random numbers.
 
     Returns:

@@ -27,25 +27,27 @@ def large_steps(
                       {\sqrt{\max v_t / (1 - \beta_2^t)} + \epsilon}
        \end{aligned} $$
 
-    The same steps as those of AdamUniform on the variable (I + λL) x, without that variable.
-    It is `filtered_adam` with `mesh_laplacian` as the filter before and after, and one second
-    moment for all vertices: its maximum. To keep creases, put `mesh_bilateral` after instead.
+    L is the Laplacian of the mesh, as in `filters.mesh_laplacian`. These are the steps of
+    AdamUniform on the variable (I + λL) x, without that variable. In other words: `filtered_adam`
+    with `mesh_laplacian` before and after, and with the largest second moment for all vertices. To
+    keep creases, make it of `filtered_adam` with `mesh_bilateral` as the `postfilter`.
 
     Args:
-        learning_rate: α, about how far the vertices move in one step; a number or a schedule.
+        learning_rate: α, about how far the vertices move in one step, in the units of the
+            positions: a number or an optax schedule.
         faces: (faces, 3), which vertices each triangle has. With `optax.inject_hyperparams`, name
             faces and lam in its static_args.
-        lam: λ, how far the steps are smoothed; about its square root in edges. The paper's: 19.
-        b1: decay of the first moment.
-        b2: decay of the second moment. With b1 = b2 = 0 nothing is kept between steps.
-        eps: keeps the division from zero.
+        lam: λ, how far steps are smoothed: over about √λ edges. The paper has 19.
+        b1: β1, how much of the first moment a step keeps.
+        b2: β2, how much of the second moment a step keeps. With b1 = b2 = 0 there is no state.
+        eps: ε, keeps the division from zero.
 
     Returns:
         An optax transformation for positions (vertices, 3). For other leaves in the same pytree,
         choose the positions with `optax.masked` or `optax.multi_transform`.
 
     Raises:
-        ValueError: faces or lambda that `mesh_laplacian` refuses; on update, no parameters.
+        ValueError: faces or a lam that `mesh_laplacian` refuses; in `update`, no parameters.
 
     Example:
         >>> import jax, jax.numpy as jnp, optax, smoothdiff as sd

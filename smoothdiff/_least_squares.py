@@ -50,16 +50,16 @@ class LeastSquares(AbstractBaseline):
        \mathbb{E}_{u}[b(m + s u)] = \beta_0 + \beta \cdot m + m \cdot A m + \sum_j s_j^2 A_{jj} $$
 
     For a quadratic function and enough samples, (n+1)(n+2) for example, gradient and Hessian are
-    exact to rounding. With fewer than 1.5 samples for each of its coefficients, the full quadratic
-    gives way to one without mixed terms, that to a linear function, and that to ridge regression.
-    An antithetic pair counts as one sample of the odd and one of the even coefficients; samples
-    that may be dropped count half.
+    exact to rounding. A fit needs 1.5 samples for each of its coefficients. Where there are fewer,
+    the full quadratic gives way to one without mixed terms, that to a linear function, and that to
+    ridge regression. An antithetic pair counts as one sample of the odd and one of the even
+    coefficients; samples that may be dropped count half.
 
-    For independent samples the fit that is subtracted from a sample leaves that sample (pair,
-    frame, replicate) out, in closed form, so the estimate is unbiased. A single scrambled point
-    set, and any set with `in_sample=True`, is fitted as a whole: then derivatives up to the degree
-    are those of the bare fit, less noisy and biased by O(1/N): for the gradient of a cubic in
-    three dimensions and degree 2, -30 % at N = 16, -6 % at 64 and -0.8 % at 256.
+    With independent samples each sample (pair, frame, replicate) is left out of its own fit, in
+    closed form. So the estimate is unbiased. A single scrambled point set, and any set with
+    `in_sample=True`, is fitted as a whole. Derivatives up to the degree are then those of the bare
+    fit: less noisy, and biased by O(1/N). With degree 2 the gradient of a cubic in three dimensions
+    is off by -30 % at N = 16, -6 % at 64 and -0.8 % at 256.
 
     Args:
         degree: 1 or 2.

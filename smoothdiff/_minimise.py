@@ -58,17 +58,18 @@ def minimise(
 
     $$ \min_y F(y), \qquad F(y) = \mathbb{E}_z[f(y + \sigma z, \text{args})] $$
 
-    Without a solver it is `NewtonCG(sigma)`, and from 100 parameters on `FirstOrder` with Adam,
-    whose steps are 0.15 sigma. Without a sigma it is a fifth of a parameter's range if it has one,
-    else a fifth of the largest number of its leaf of y0, or 0.2 if that is zero. `NewtonCG` needs
-    no more than the order of magnitude: where all of its first points have the same value, others
-    follow up to a thousand sigma away, and the first ones again where these found a change.
+    The default solver is `NewtonCG(sigma)`, and from 100 parameters on `FirstOrder` with Adam,
+    whose steps are 0.15 sigma. The default sigma is a fifth of a parameter's range. A parameter
+    without one gets a fifth of the largest number of its leaf of y0, or 0.2 if that is zero. For
+    `NewtonCG` the order of magnitude will do. If all of its first points have the same value, it
+    looks up to a thousand sigma away; where it finds a change, it takes the first points again.
 
-    The iterates are, but for rounding, those of `optimistix.minimise(fun, solver, y0, args,
-    options={"key": key})`, with `"bounds": bounds` in the options if there are any. With fewer than
-    100 parameters the function is called between steps that are compiled once for all functions.
-    Else a step is compiled for each function object and solver, so pass the same ones again rather
-    than new lambdas.
+    But for rounding, the iterates are those of `optimistix.minimise(fun, solver, y0, args,
+    options={"key": key})`, with `"bounds": bounds` in the options if there are any.
+
+    With fewer than 100 parameters the function is called between steps, which are compiled once for
+    all functions. Otherwise a step is compiled for each function object and solver: pass the same
+    objects again, not new lambdas.
 
     Ctrl-C ends the run, without a further evaluation, and returns what has been found.
 
@@ -85,7 +86,7 @@ def minimise(
         max_evaluations: the most evaluations of `fun`, never exceeded. Some are set aside to judge
             the result under noise; without noise they may stay unused. If neither this nor
             `max_steps` is given, the limit is 200 (n + 1) for `NewtonCG` and `GaussNewton` with
-            n < 100 parameters, which end by themselves before, and 256 steps for others.
+            n < 100 parameters, which mostly end before by themselves, and 256 steps for others.
         max_steps: steps after which to stop.
         max_seconds: seconds after which no further step begins.
         space: what each parameter may be, such as `Range(1e-3, 10, log=True)`: one space, or a
@@ -93,24 +94,23 @@ def minimise(
             which sigma is given; `fun`, the records and the result have natural values.
         bounds: a pair (low, high), each a number or a pytree like `y0`. `fun` sees no other points.
         takes_key: whether `fun` draws random numbers. It is called as `fun(y, args, key)`, and its
-            mean over keys is minimised: one fixed key has a minimum of its own. A step has one key,
-            the next a fresh one; with fewer than 100 parameters, all that the local model compares
-            has one. Where that ends, rounds of samples follow until a limit ends the run, and `y`
-            is the mean of their centers, unless with three fresh keys another point is clearly
-            lower. A black box takes a seed: `lambda y, args, key: box(y, jax.random.bits(key))`.
+            mean over keys is minimised, as one fixed key has a minimum of its own. Evaluations that
+            are compared get the same key: those of a step or, with fewer than 100 parameters, all
+            that the local model compares. Then rounds of samples follow until a limit ends the run.
+            `y` is the mean of their centers, unless another point is clearly lower with three fresh
+            keys. A black box takes a seed: `lambda y, args, key: box(y, jax.random.bits(key))`.
             Under optimistix args is (args, key), with the option `"takes_key": True`.
         callback: called with each step's `Record`; the run stops if it returns something true.
-        progress: show a progress bar, which says "compiling" in the first step, and in the first of
-            each kind.
-        keep_iterates: whether the history has all iterates, which take as many numbers as there
-            are parameters for each step, in memory and in the checkpoint. By default with fewer
-            than 10,000 parameters. The callback gets each iterate all the same.
-        checkpoint: a file that keeps the run. The same call takes up the run that it finds there
-            and ends with the same result as if there had been no interruption; with a larger
-            `max_steps` or `max_evaluations` it goes on. Written as often as is cheap, and at the
-            end, whatever ended the run. A run is taken up only if the call is the same, numbers and
-            code included, and if `fun` gives the same value again at the lowest point, an
-            evaluation that is not counted. Where it cannot be written, a warning says so.
+        progress: show a progress bar. It says "compiling" in the first step of each kind.
+        keep_iterates: whether the history has all iterates, by default with fewer than 10,000
+            parameters. They take n numbers a step, in memory and in the checkpoint. The callback
+            gets each iterate in any case.
+        checkpoint: a file that keeps the run. The same call continues the run that it finds there,
+            and ends with the same result as without an interruption. With a larger `max_steps` or
+            `max_evaluations` it goes on. The file is written as often as is cheap, and at the end,
+            whatever ended the run; a warning says if that fails. A run is continued only if the
+            call is the same, numbers and code included, and if `fun` gives the same value again at
+            the lowest point. That evaluation is not counted.
 
     Returns:
         A `Result`.
@@ -164,7 +164,7 @@ def least_squares(
     $$ \min_y \tfrac12 \sum_p r_p(y)^2, \qquad r(y) = f(y, \text{args}) $$
 
     The twin of `minimise` for functions that return residuals, such as an image minus its
-    reference: an evaluation teaches all of them, so far fewer are needed. The iterates are those of
+    reference. An evaluation teaches all of them, so far fewer are needed. The iterates are those of
     `optimistix.least_squares(fun, solver, y0, args, options={"key": key})`.
 
     Args:
@@ -172,10 +172,10 @@ def least_squares(
         y0: where to start, a pytree of numbers and arrays.
         args: passed on to `fun`.
         key: a random key; the same key gives the same run.
-        solver: how to step. By default `GaussNewton(sigma)`. With a `support`,
-            `LocalCrossEntropy(support)` where no sigma is given, each parameter has finite bounds,
-            the support does not move, and a term has at most ten parameters in the mean; else
-            `LocalGaussNewton(sigma, support)`. An optimistix solver around one is as good.
+        solver: how to step, by default `GaussNewton(sigma)`. With a `support` the default is
+            `LocalGaussNewton(sigma, support)`; or `LocalCrossEntropy(support)`, if no sigma is
+            given, all bounds are finite, the support does not move, and a term has at most ten
+            parameters on average. It may be an optimistix solver around one of ours.
         sigma: as for `minimise`.
         support: which residuals each parameter may move, as for `LocalGaussNewton`.
         target: as for `minimise`; half the sum of squares.

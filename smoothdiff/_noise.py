@@ -21,7 +21,7 @@ class Noise(Protocol):
     `optax.perturbations`. Derivatives are as good as `log_prob` is smooth.
 
     Raises:
-        TypeError: the transforms do, for a `noise` without these two methods.
+        TypeError: from the transforms, for a `noise` that lacks one of these methods.
 
     Example:
         >>> import jax, jax.numpy as jnp, optax, smoothdiff as sd

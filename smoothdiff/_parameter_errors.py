@@ -135,7 +135,7 @@ def _why(further: bool, count: int) -> str:
         )
     return (
         "Either they do not, or only on a combination, or they jump or curve as near as was "
-        f"looked. Then call {call} again, which mostly looks nearer, or make the function "
+        f"looked. Then call {call} again, which looks in other directions, or make the function "
         "smoother, by finer time steps say"
     )
 

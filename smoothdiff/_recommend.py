@@ -40,7 +40,7 @@ class Recommendation:
         solver: to pass to the function `run`.
         sigma: its smoothing width, in unit coordinates where there is a space.
         run: "least_squares" or "minimise".
-        max_evaluations: after which the run ends without any other limit; usually it does before.
+        max_evaluations: the limit of a run that is given none; usually it ends before.
         seen: what the samples showed.
         advice: what to try.
         evaluations: of the function, for this.
@@ -92,14 +92,15 @@ def recommend(
 ) -> Recommendation:
     """Says what to choose for a function, what it looks like around y0, and what to try.
 
-    The solver and sigma are those that `minimise` or `least_squares` would choose, but for what was
-    seen: where nothing changes within sigma it is wider, and where values are not finite the solver
-    leaves them out. Whether residuals or one number are returned decides between the two.
+    The run is `least_squares` if `fun` returns residuals, and `minimise` if it returns one number.
+    Solver and sigma are those which that would choose, with two exceptions: sigma is wider where
+    nothing changes within it, and the solver leaves out values that are not finite, if it saw any.
 
-    It evaluates y0 twice, and one sigma to both sides along each parameter; with 100 parameters and
-    more along 8 random directions. Where nothing changes, up to 6 evaluations follow up to 64 sigma
-    away, and where something does, 6 between there and y0, which tell jumps from slopes. In all it
-    takes at most 2 n + 14 evaluations, where n is 8 for many parameters; 2 n + 4 if there is noise.
+    It evaluates y0 twice, and points one sigma to both sides along each parameter; with 100
+    parameters and more, along 8 random directions. If nothing changes, up to 6 evaluations follow,
+    up to 64 sigma away. Where something changes, 6 between there and y0 tell jumps from slopes. In
+    all it takes at most 2 n + 14 evaluations, where n is 8 for many parameters, or 2 n + 4 if there
+    is noise.
 
     Args:
         fun: the function, `fun(y, args)`: one number, or residuals. May contain a black box.

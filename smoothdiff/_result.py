@@ -33,16 +33,15 @@ class Record(NamedTuple):
         step: which step, from 1.
         evaluations: evaluations of the function so far.
         seconds: time since the start, compilation included; a resumed run counts on.
-        fun: the lowest value of the function so far, of all points that were evaluated, at the
-            iterate or not; of least squares half the sum of squares. With noise it owes much to
-            luck.
-        smoothed: the smoothed function where the step started, as its batch estimated it; NaN of a
-            solver that goes point by point.
+        fun: the lowest value so far, of all points that were evaluated; of least squares half the
+            sum of squares. With noise it owes much to luck.
+        smoothed: the smoothed function where the step started, as its batch estimated it; NaN if
+            the solver goes point by point.
         stderr: the standard error of `smoothed`; NaN where the batch cannot tell.
         sigma: the smoothing width of the step, the widest if there are several.
         y: the iterate after the step; None in a history without iterates.
-        best: the point at which the function was `fun`, which a run that is stopped returns; for
-            callbacks, None in a history.
+        best: the point at which the function was `fun`. A run that is stopped returns it. For
+            callbacks; None in a history.
 
     Example:
         >>> import jax, jax.numpy as jnp, smoothdiff as sd
@@ -71,11 +70,11 @@ class Result:
     """What `minimise` found.
 
     Attributes:
-        y: the best point. Without noise it is the lowest that was evaluated. With noise, which
-            shows when that point is evaluated again, a few candidates are evaluated afresh, the
-            start among them, and the lowest wins. For `takes_key=True` see `minimise`. If the run
-            was cut short ("interrupted", or an error), it is the lowest that was evaluated, which
-            with noise may be luck.
+        y: the best point. Without noise it is the lowest that was evaluated. Noise shows when that
+            point is evaluated again; then a few candidates, the start among them, are evaluated
+            afresh, and the lowest wins. For `takes_key=True` see `minimise`. If the run was cut
+            short ("interrupted", or an error), it is the lowest that was evaluated, which with
+            noise may be luck.
         fun: the function there; of least squares half the sum of squares. With noise, the mean of
             three fresh evaluations.
         smoothed: the smoothed function there, from a last batch. If a point of that batch is lower
@@ -83,10 +82,10 @@ class Result:
         stderr: the standard error of `smoothed`.
         evaluations: evaluations of the function, the judgement included; not those of a step that
             was broken off.
-        reason: why the run stopped: "target", "max_steps", "max_evaluations", "max_seconds",
-            "callback", "interrupted", or what the solver says: "converged", "stalled" after too
-            many evaluations without a lower point, "noise" where nothing but noise is left; in an
-            error "nonfinite" or "failed".
+        reason: why the run stopped. A limit: "target", "max_steps", "max_evaluations",
+            "max_seconds", "callback", "interrupted". Or the solver: "converged"; "stalled", after
+            too many evaluations without a lower point; "noise", where nothing but noise is left. In
+            an error: "nonfinite" or "failed".
         history: one `Record` for each step, with the iterates if `keep_iterates` says so.
         solver: the solver, also where none was given.
         state: its last state.
@@ -120,14 +119,15 @@ class Result:
         $$ C = s^2 (J^T J)^{-1}, \qquad s^2 = \sum_p r_p^2 / (P - n) $$
 
         It holds at a minimum, for P residuals whose errors are independent and of the same size. J
-        is fitted to those evaluations of the run that are near `y`, and no more are made for it.
-        With a space, C is that in unit coordinates, times the slopes of the natural values.
+        is fitted to those evaluations of the run that are near `y`; no more are made for it. With a
+        space, C is computed in unit coordinates and multiplied by the slopes of natural values.
 
-        NaN for a parameter at a bound, where the others' errors hold it, and for those of which the
-        evaluations do not tell enough; a warning names them, and `with_covariance` evaluates more.
-        Do so, too, for a function that jumps, of which near evaluations may show one jump alone,
-        and for one that takes a key, as those with several keys tell no slopes.
-        None unless the solver is `GaussNewton` with fewer than 100 parameters.
+        NaN for a parameter at a bound; the errors of the others hold for it fixed there. NaN also
+        for a parameter of which the evaluations do not tell enough: a warning names it, and
+        `with_covariance` evaluates more. Call that as well for a function that jumps, as near
+        evaluations may show one jump alone, and for one that takes a key, as evaluations with
+        several keys tell no slopes. None unless the solver is `GaussNewton` with fewer than 100
+        parameters.
         """
         return None if self._errors is None else self._errors.covariance
 

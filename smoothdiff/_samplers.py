@@ -189,12 +189,12 @@ class Sobol(PointSampler):
 
     Args:
         antithetic: mirror every point. Scrambled points are better without.
-        replicates: the points are this many independently scrambled sets of `num_samples /
-            replicates`. With one, the default, standard errors are an upper bound. Of 8 sets with
-            baseline="mean" they are honest, for 1.9 times the error at N = 256 in ten dimensions:
-            94 % of the 95 % intervals of Student's t with 7 degrees of freedom hold the true
-            gradient. Of 4 sets it is 96 %, for 1.4 times the error. With "gp" several sets leave
-            the errors an upper bound, four times as wide or more, so one is best.
+        replicates: how many independently scrambled sets there are, of `num_samples / replicates`
+            points each. With one, the default, standard errors are an upper bound. Eight sets with
+            baseline="mean" make them honest, at 1.9 times the error (N = 256, ten dimensions): 94 %
+            of the 95 % intervals by Student's t, with 7 degrees of freedom, hold the true gradient.
+            With four sets 96 % do, at 1.4 times the error. With "gp" the standard errors stay an
+            upper bound, four times too wide or more, so one set is best.
 
     Raises:
         ValueError: fewer than one replicate; when points are drawn, a `num_samples` that is no

@@ -27,22 +27,22 @@ _SHARES = (2.0, 0.5, 4.0, 0.25)
 class Search:
     """A search that the caller steers: `ask` for points, evaluate them anywhere, `tell` the values.
 
-    Points may be told in any order. Some may be missing, or have failed with a NaN, and more may be
-    asked for before all are told, so that no worker waits for the slowest. Values at points that
-    were never asked for teach as well, so earlier evaluations can be told at the beginning. A new
-    search with the same key that is told the same values in the same order is where the old one
-    was: to save a search, keep points and values.
+    Points may be told in any order. Some may be missing, or have failed with a NaN. More may be
+    asked for before all are told, so no worker waits for the slowest. Values at points that were
+    never asked for teach as well, so earlier evaluations can be told at the beginning. To save a
+    search, keep its points and values: a new search with the same key that is told the same values
+    in the same order goes on where the old one was.
 
-    What the model asks for next comes first. If that is still out, the step of the local model is
-    followed by others, nearer and further, and a round of samples by its next ones. A point that
-    nobody tells is given out again after twice as many others as are out. One at a time, these are
-    the steps of `minimise` and `least_squares`.
+    `ask` gives what the model wants next. If that is still out, further points follow: in the local
+    model shorter and longer steps, in a round of samples its next ones. A point that nobody tells
+    is given out again, after twice as many others as are out. One point at a time, these are the
+    steps of `minimise` and `least_squares`.
 
     Args:
         y0: where to start, a pytree of numbers and arrays.
         key: a random key.
-        residuals: whether residuals are told for each point, of which half the sum of squares is
-            minimised, or one number.
+        residuals: whether each point is told its residuals, of which half the sum of squares is
+            minimised. If not, it is told one number.
         solver: a `NewtonCG`, or with residuals a `GaussNewton`, for fewer than 100 parameters. The
             default, as for `minimise`, has `nonfinite="drop"`, which failed evaluations need.
         sigma: of the default solver, as for `minimise`.

@@ -65,8 +65,8 @@ def load_store(path: str | os.PathLike) -> list[Evaluation]:
         path: the file.
 
     Returns:
-        Pairs (args, value) of NumPy arrays in tuples, lists and dicts as they were. What was in
-        nodes of other kinds, such as modules of equinox, is a tuple of the arrays in them.
+        A list of `Evaluation`: pairs (args, value) of NumPy arrays, in tuples, lists and dicts as
+        they were. Nodes of other kinds, such as modules of equinox, become tuples of their arrays.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -74,7 +74,7 @@ def load_store(path: str | os.PathLike) -> list[Evaluation]:
 
     Example:
         >>> import tempfile, jax, jax.numpy as jnp, numpy as np, smoothdiff as sd
-        >>> path = tempfile.mktemp()
+        >>> path = tempfile.mkdtemp() + "/distances.db"
         >>> f = sd.black_box(lambda y: np.abs(y - 1).sum(), 0.0, store=path)
         >>> values = jax.vmap(f)(jnp.arange(4.0)[:, None])
         >>> [float(value) for _, value in sd.load_store(path)]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PyTree
 
-from smoothdiff._covariance import Slopes, slopes
+from smoothdiff._covariance import Slopes, balance, slopes
 from smoothdiff._host_steps import evaluator, rows_at
 from smoothdiff._parameter_errors import Answer
 from smoothdiff._params import layout_of
@@ -17,8 +17,10 @@ from smoothdiff._reraise import reraise
 from smoothdiff._result import NO_COVARIANCE, Result, kept_residuals
 from smoothdiff._solvers._random_numbers import keyed
 
-# how far from the answer, in standard errors: the ends of 95 % intervals
-_ERRORS = 2.0
+# How far from the answer, in standard errors: to the ends of 95 % intervals, and in further calls
+# farther, where a jump matters less. Where the function curves nearer, but not so near that slopes
+# are those of a ripple: an error is about what holds over its own length.
+_ERRORS, _FARTHEST, _NEAREST = 2.0, 4.0, 0.3
 
 
 def with_covariance(
@@ -26,28 +28,33 @@ def with_covariance(
 ) -> Result:
     r"""The same result with further evaluations around its answer, for its standard errors.
 
-    $$ y \pm 2 s v_k / |J v_k|, \qquad k = 1 \dots n $$
+    $$ y \pm c_k \, s v_k / |J v_k|, \qquad 0.3 \le c_k \le 2, \quad k = 1 \dots n $$
 
-    `Result.covariance` is free, as it makes do with the evaluations of the run. Where those do not
-    tell the slopes at the answer, it is NaN and warns. Then this evaluates the residuals two
-    standard errors to both sides along each principal axis of the ellipsoid that they are known to
-    have. It can be called again, when these are known better: a first call may look too far, where
-    the function jumps or curves, and leave NaN. Its warning says so.
+    `Result.covariance` is free: it makes do with the evaluations of the run. Where those do not
+    tell the slopes J at the answer, it is NaN and warns. Then call this. It evaluates the residuals
+    to both sides of the answer along n axes, those of the ellipsoid that the errors are known to
+    have. It looks two standard errors away, and nearer where the residuals curve.
+
+    If some errors are still NaN, call it again. Each further call turns the axes and looks up to
+    four standard errors away, so that jumps average out. It never looks nearer than 0.3 standard
+    errors: on a function with jumps or ripples, slopes over shorter distances give errors that are
+    far too small. What stays NaN is not known to be linear over its own error; profile it with
+    `plot.slice`.
 
     Args:
         fun: the residuals, as for `least_squares`.
         result: what that returned.
         args: passed on to `fun`.
-        key: for a function that takes one, which is then the same in all of these evaluations.
+        key: a random key, if the function takes one. All of these evaluations get the same key.
 
     Returns:
-        The result with 2 `evaluations` more for each parameter that is not at a bound, and another
-        `covariance`. `y` is the same, also if one of these was lower: then the run had not
-        converged.
+        The result with a new `covariance`, and 2 `evaluations` more for each parameter that is not
+        at a bound. `y` stays the same, even if one of these evaluations was lower: then the run had
+        not converged.
 
     Raises:
-        ValueError: a result without a covariance, of `minimise`, of `LocalGaussNewton` or of 100
-            parameters or more; a function with another number of residuals; a key that is missing,
+        ValueError: the result has no covariance, as it is of `minimise`, of `LocalGaussNewton` or
+            of 100 parameters or more; `fun` returns another number of residuals; a key is missing,
             or given to a function that takes none.
         BlackBoxError: an evaluation failed.
 
@@ -107,11 +114,21 @@ def _around(
         sigma = layout.vector(jax.tree.leaves(jax.tree.broadcast(result.solver.sigma, answer.y)))
         steps = np.diag(np.asarray(sigma))[free]
     else:
+        calls = len(answer.more)
         values, axes = np.linalg.eigh(known.squares[np.ix_(free, free)])
-        squares = 2 * result.fun / max(size - len(free), 1)
-        error = np.sqrt(squares / np.maximum(values, np.finfo(float).tiny))
+        values = np.maximum(values, np.finfo(float).tiny)
+        error = np.sqrt(2 * result.fun / max(size - len(free), 1) / values)
+        farthest = min(_ERRORS + calls, _FARTHEST) * error
+        length = np.clip(balance(known, values), _NEAREST * error, farthest)
         # neither lost in rounding nor farther than anything that was seen
-        length = np.clip(_ERRORS * error, np.sqrt(np.finfo(dtype).eps), 1)
+        length = np.clip(length, np.sqrt(np.finfo(dtype).eps), 1)
+        # the same directions again would see the same jumps
+        turn = _turned(calls, len(free)) if calls else np.eye(len(free))
         steps = np.zeros((len(free), n))
-        steps[:, free] = (length * axes * known.scale[free, None]).T
+        steps[:, free] = (length * axes @ turn * known.scale[free, None]).T
     return np.clip(np.concatenate([here + steps, here - steps]).astype(dtype), low, high)
+
+
+def _turned(seed: int, n: int) -> Float[np.ndarray, "n n"]:
+    """Perpendicular directions, drawn at random; the same for the same seed."""
+    return np.linalg.qr(np.random.default_rng(seed).standard_normal((n, n)))[0]

@@ -27,13 +27,14 @@ _ABREAST = 4
 def history(
     result: Result, *, ax: Any = None, against: Literal["evaluations", "seconds"] = "evaluations"
 ) -> Any:
-    r"""The function against evaluations or seconds: the lowest so far, and the smoothed one.
+    r"""Draws the course of a run: the lowest value so far, and the smoothed function.
 
     $$ \min_{i \le t} f(x_i) \quad\text{and}\quad F(y_t) \pm 1.96 \text{ standard errors} $$
 
-    The first is that of all points $x_i$ that were evaluated, the second that of the iterates,
-    where a solver takes a batch of samples a step. The dot is the answer. The axis is logarithmic
-    if the values are not negative and span a factor of ten.
+    The solid line is the lowest value of all points $x_i$ that were evaluated until then. Where the
+    solver takes a batch of samples a step, the smoothed function at its iterates $y_t$ is drawn
+    too, with a 95 % band. The dot is the answer. The axis of values is logarithmic if none is
+    negative and they span a factor of ten.
 
     Args:
         result: what `minimise` or `least_squares` returned.
@@ -106,22 +107,22 @@ def slice(
     $$ t \mapsto f(y + t e_j) \quad\text{and}\quad
        t \mapsto \mathbb{E}_z[f(y + t e_j + \sigma z)] $$
 
-    Shows whether a minimum is one, whether sigma bridges steps and ripples, and whether a parameter
-    matters at all. The band is a 95 % interval. All points of a line see the same random numbers,
-    so that their errors move it as a whole and do not make it rough. Takes `num_samples` + 1
-    evaluations a point.
+    It shows whether a point is a minimum, whether sigma bridges steps and ripples, and whether a
+    parameter matters at all. The band is a 95 % interval. All points of a line share their random
+    numbers: an error moves the line as a whole, and does not make it rough. Each point takes
+    `num_samples` + 1 evaluations.
 
     Args:
         fun: the function, `fun(y, args)`, which returns one number. May contain a black box.
         y: the point, such as `result.y`: a pytree of numbers and arrays, in natural values.
         args: passed on to `fun`.
-        sigma: the smoothing width of all parameters, as for `smooth`; in unit coordinates where
-            there is a space, whose own is the default.
+        sigma: the smoothing width of all parameters, as for `smooth`. With a space it is in unit
+            coordinates, and by default the width that the space has.
         key: a random key.
-        parameter: one number of `y`, by its position among all of them or by its label. By default
-            each of them, on axes of its own.
-        space: what the parameters may be, as for `minimise`. A parameter is shown over its whole
-            range or period; over four sigma to either side if it has neither.
+        parameter: which number of `y` to vary, by its position among all of them or by its label.
+            By default each in turn, on axes of its own.
+        space: what the parameters may be, as for `minimise`. A parameter is drawn over its whole
+            range or period, and if it has neither, over four sigma to either side.
         labels: names for the numbers of `y`, with units; by default those of the spaces, or of the
             pytree.
         points: how many points a line has.
@@ -189,10 +190,10 @@ def errors(
     $$ y_j \pm 1.96 \, s_j $$
 
     Args:
-        values: what `least_squares` returned, which is drawn with its `parameter_intervals`; or the
+        values: a `Result` of `least_squares`, which is drawn with its `parameter_intervals`; or the
             parameters, a pytree of numbers and arrays.
-        stderrs: of parameters their standard errors, a pytree like them. No interval where one is
-            not finite.
+        stderrs: the standard errors of such parameters, a pytree like them. A parameter whose error
+            is not finite is drawn without an interval.
         labels: a name for each number, with its unit; by default from the space, or the pytree.
         ax: the matplotlib axes to draw into, by default new ones.
 

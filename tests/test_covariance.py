@@ -2,6 +2,7 @@
 
 import dataclasses
 import pickle
+import warnings
 from typing import Any
 
 import equinox as eqx
@@ -13,7 +14,7 @@ from jax.flatten_util import ravel_pytree
 from scipy.special import stdtrit
 
 import smoothdiff as sd
-from smoothdiff._covariance import covariance, slopes
+from smoothdiff._covariance import balance, covariance, slopes
 
 KEY = jax.random.key(0)
 DESIGN = np.float32(np.random.default_rng(9).standard_normal((20, 4)) * [1, 3, 0.1, 1])
@@ -212,6 +213,30 @@ def test_an_answer_of_an_earlier_search_is_evaluated_again():
     np.testing.assert_allclose(again.covariance, expected(decay, result), rtol=0.05)
 
 
+@pytest.mark.slow
+def test_ripples_on_logarithmic_ranges_are_no_slopes():
+    """A few calls give the closed form of the function without its jumps."""
+    phases = 30 * jax.random.normal(jax.random.key(7), (60, 4))
+    t = jnp.linspace(0.0, 3.0, 60)
+    curve = lambda y: y["a"] * jnp.exp(-y["b"] * t) * jnp.cos(y["w"] * t + y["c"])
+
+    def rippled(y):
+        phase = phases @ jnp.log(ravel_pytree(y)[0])
+        return curve(y) + 0.03 * (phase - jnp.floor(phase) - 0.5)
+
+    truth = {"a": 2.0, "b": 0.4, "w": 6.0, "c": 0.3}
+    space = {name: sd.Range(1e-3, 10.0, log=True) for name in truth}
+    start = {name: 1.1 * y for name, y in truth.items()}
+    data = noisy(curve, truth, 0.3)
+    result = fitted(rippled, data, start, space=space)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # it says what is not known yet
+        for _ in range(4):
+            result = sd.with_covariance(lambda y, data: rippled(y) - data, result, data)
+    errors = ravel_pytree(result.parameter_errors)[0]
+    np.testing.assert_allclose(errors, np.sqrt(np.diag(expected(curve, result))), rtol=0.2)
+
+
 def test_a_result_can_be_kept_in_a_file():
     result = fitted(line, noisy(line, TRUTH, 1.0))
     kept = pickle.loads(pickle.dumps(result))
@@ -245,6 +270,21 @@ def test_curvature_is_no_noise():
     rows = np.sin(points @ jacobian.T) + (points @ jacobian[::-1].T) ** 2
     found = covariance(slopes(points, rows, 0), 100, 98.0, np.zeros(2, bool))
     np.testing.assert_allclose(found.matrix, np.linalg.inv(jacobian.T @ jacobian), rtol=0.01)
+
+
+@pytest.mark.parametrize("noise", [1e-4, 1e-2])
+def test_further_evaluations_lie_where_noise_and_curvature_are_the_same(noise):
+    """At a distance d with noise = 3 d^2; a factor of two is as good as the grid."""
+    rng = np.random.default_rng(3)
+    jacobian, bend = rng.standard_normal((200, 2)), 3 * rng.standard_normal(200)
+    points = rng.standard_normal((40, 2)) * 10 ** rng.uniform(-2.5, 0, (40, 1))
+    points[0] = 0
+    curved = np.sum(points**2, axis=1, keepdims=True) * bend
+    rows = points @ jacobian.T + curved + noise * rng.standard_normal((40, 200))
+    known = slopes(points, rows, 0)
+    assert known is not None
+    along = known.scale * balance(known, np.diag(known.squares))
+    np.testing.assert_allclose(np.log(along), np.log((noise / 3) ** 0.5), atol=np.log(2))
 
 
 def test_too_few_evaluations_tell_nothing():

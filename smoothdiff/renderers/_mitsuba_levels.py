@@ -32,11 +32,11 @@ def levels(
 
     $$ r_k(y) = 2^k \, (\text{image}_k(y) - \text{photo}_k) $$
 
-    From the finest level, which has the pixels of the photograph and `spp` samples of each, to the
-    coarsest each level has half as many pixels along a side and a quarter of the samples, but not
-    fewer than 4, and 1,024 in all. A photograph of fewer pixels has their means. Where the
-    integrator has a `max_depth`, the two finest levels have it and others at most 3. What a level
-    costs is its number of samples, times the depth.
+    The finest level has the pixels of the photograph, with `spp` samples each. Each coarser level
+    has half as many pixels along a side, and a quarter of the samples of a pixel, but no fewer than
+    4 for a pixel and 1,024 for the picture. Its photograph has the means of the pixels. Where the
+    integrator has a `max_depth`, the two finest levels keep it, and the others have at most 3. The
+    cost of a level is its number of samples, times the depth.
 
     Args:
         scene: as for `renderer`; the path of a file or a dict, as each level loads its own.
@@ -44,10 +44,10 @@ def levels(
         photo: the photograph, linear RGB, of any size. Halves of it must be whole numbers of
             pixels, so a power of two allows most levels.
         spp: samples of a pixel at the finest level.
-        integrator: a dict as for `mitsuba.load_dict`, or None for that of the scene, which can be
-            read only if the scene is a dict.
-        inputs: the parameters that are varied, as `renderer` takes them, as a function of y.
-        coarsest: pixels along the shorter side, which no level falls below.
+        integrator: a dict as for `mitsuba.load_dict`. None: that of the scene, which must then be a
+            dict itself.
+        inputs: a function from y to what `renderer` takes, by default y itself.
+        coarsest: the least number of pixels along the shorter side.
         **options: as for `renderer`: `axis`, `sensor`, `variant`, `seed`, `noise`.
 
     Returns:
