@@ -26,13 +26,14 @@ class MLP(eqx.Module):
     Args:
         size: the number of parameters.
         width: neurons in a hidden layer.
-        depth: hidden layers. The paper has three of 64 below 50 parameters, of which two learn as
-            much, and eight of 128 from there on, which took longer to learn anything.
-        activation: leaky ReLU is the paper's. A smooth one leaves less of the error where there
-            are few parameters, and it has a second derivative.
-        frequencies: L, the octaves of a positional encoding, which the paper has from 50 parameters
-            on without a number.
-        key: draws the weights, uniform in plus and minus the root of one over a layer's inputs.
+        depth: hidden layers. Below 50 parameters the paper has three of 64 neurons, of which two
+            learn as much; from there on eight of 128, which took longer to learn anything.
+        activation: the paper has leaky ReLU. A smooth one leaves less of the error where there are
+            few parameters, and it has a second derivative.
+        frequencies: L, the octaves of a positional encoding. The paper has one from 50 parameters
+            on, and does not say how many octaves.
+        key: draws the weights, uniform within the root of one over a layer's inputs to both sides
+            of zero.
 
     Example:
         >>> import functools, jax, jax.numpy as jnp

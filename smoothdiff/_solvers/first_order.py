@@ -57,10 +57,10 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
     $$ y_{t+1} = \Pi\left(y_t + u_t\right), \qquad
        u_t = \text{optax}\left(\hat\nabla F_{\sigma_t}(y_t)\right), $$
 
-    with $\Pi$ the projection onto the bounds, and one batch of `num_samples` evaluations a step for
-    the gradient, the value and its standard error. Candidates for the point returned, beside the
-    lowest that was evaluated: the last iterate, the running average of the last ten or so (best
-    where noise makes the iterates wander), the one of lowest estimate, and the start.
+    $\Pi$ is the projection onto the bounds. Each step takes one batch of `num_samples` evaluations,
+    for the gradient, the value and its standard error. The point returned is the best of these: the
+    lowest that was evaluated, the last iterate, the running average of about the last ten (best
+    where noise makes the iterates wander), the iterate of lowest estimate, and the start.
 
     Args:
         optim: an optax transformation, such as `optax.adam(0.1)`. It may ask for `value` and

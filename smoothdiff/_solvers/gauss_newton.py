@@ -37,9 +37,9 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
 
     With fewer than 100 parameters the function is evaluated point by point.
 
-    - **The first points** are the start, and one sigma from it along each parameter. If the loss
-      there is more than ten times as high, a nearer point follows, and the widths of that parameter
-      shrink as much. If all residuals are the same, pairs of points follow, each four times as far
+    - **The first points** are the start, and one sigma from it along each parameter. Where the loss
+      is more than ten times as high there, a nearer point follows, and the width of that parameter
+      shrinks as much. If all residuals are the same, pairs of points follow, each four times as far
       away, up to a thousand sigma. Where these find a change, the first points are taken again.
     - **The local model** needs one evaluation a step. $y_t$ is the best point. J fits the nearest
       points, and of all that do it differs least from the last J. The radius $\Delta$ grows if the
@@ -52,31 +52,33 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
        u = -(J^T \Gamma^{-1} J + I)^{-1} J^T \Gamma^{-1} m $$
 
     The metric $\Gamma$ is the covariance of what a linear model of the last `history` evaluations
-    leaves. So pixels that jump at random have no say. Where all do, the step is damped as by
-    Levenberg and Marquardt. The local model goes on once two steps of the regression in a row are
-    as predicted, or once 6 (n + 1) evaluations have found nothing lower.
+    cannot explain. So pixels that jump at random have no say. Where all pixels do, the step is
+    damped as by Levenberg and Marquardt. The local model takes over again once two steps of the
+    regression in a row are as predicted, or once 6 (n + 1) evaluations have found nothing lower.
 
-    With 100 parameters and more, or with a schedule of sigma, each step takes a batch, and the
-    wide regression alone. A batch may say little about each of so many parameters. Then 12 of the
-    evaluations go to the ends of 12 steps, and the best is taken if it is an improvement. Some are
-    the step above at several lengths. The others use a Jacobian without the entries that may be
-    chance. That finds the sparsity pattern, which residuals a parameter moves, if these are few,
-    from a number of samples that grows with the logarithm of n. It takes n x P numbers for P
-    residuals, and is left out where that is more than 2e8.
+    With 100 parameters and more, or with a schedule of sigma, each step takes a batch, and there is
+    the wide regression alone. A batch may say little about each of so many parameters. Then 12 of
+    its evaluations try the ends of 12 steps, and the best is taken if it is an improvement. Some
+    are the step above at several lengths. The others use a Jacobian without the entries that may be
+    chance: the sparsity pattern. If each parameter moves few residuals, the samples that this needs
+    grow with the logarithm of n only. It takes n x P numbers for P residuals, and is left out where
+    that is more than 2e8.
 
-    Nothing larger than history x history or n x n, for fewer than 100 parameters, is factorised.
-    Records have the `smoothed` loss, $\mathbb{E}_z[\frac12 \sum_p r_p(y + \sigma z)^2]$, with
-    batches only. The `smoothed` loss of the result is that of the last model, or of a last batch.
+    The largest matrix that is factorised is history x history, or with fewer than 100 parameters
+    n x n. Records have the `smoothed` loss, $\mathbb{E}_z[\frac12 \sum_p r_p(y + \sigma z)^2]$,
+    with batches only. The `smoothed` loss of the result is that of the last model, or of a last
+    batch.
 
     Args:
         sigma: the smoothing width in the units of the parameters, positive for each of them: how
-            far apart the first points are. A number or a pytree like the parameters adapts. An
-            optax schedule, a function from the number of the step to a number, is taken as it is.
+            far the first points are from the start. A number or a pytree like the parameters
+            adapts. An optax schedule, a function from the number of the step to a number, is
+            followed as it is.
         num_samples: evaluations a step, which can run at once: ends of steps at several radii. By
             default one; for 100 parameters and more n / 2, at most 96.
-        history: evaluations to keep, whose points and residuals are in memory. By default 12 n,
-            but at least 32 and at most 256, and never less than three rounds; four batches for 100
-            parameters and more.
+        history: how many evaluations to keep in memory, with their residuals. By default 12 n,
+            between 32 and 256, and at least three rounds; with 100 parameters and more, four
+            batches.
         sampler: where to sample. By default `Sobol`, for 100 parameters and more `Gaussian`, as
             few Sobol points in many dimensions make parameters look alike.
         batch_size: evaluate at most so many samples at a time, as for `smooth`.
@@ -89,13 +91,13 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         atol: absolute tolerance. With both zero no run converges; else the tolerance is at least
             the root of the rounding of `max(norm(y), norm(sigma))`.
         norm: the norm of steps and iterates.
-        patience: so many evaluations in a row without a lower point end a search; by default
-            20 (n + 1), and 100 if that is more and no other search is to follow. With batches it
-            counts steps, by default 30, and the last search goes on.
+        patience: how many evaluations in a row without a lower point end a search. By default
+            20 (n + 1), and in the last search at least 100. With batches it counts steps, by
+            default 30, and the last search goes on.
         restarts: how many searches may follow, with the first sigma and other random numbers: for
-            residuals with several minima, or with plateaus. They begin anywhere within the bounds;
-            without bounds around the best point so far, at a random width. With batches they begin
-            at the first point. The best point of all is returned.
+            residuals with several minima, or with plateaus. They begin anywhere within the bounds,
+            or without bounds around the best point so far, at a random width. With batches they
+            begin at the first point. The best point of all is returned.
 
     Raises:
         ValueError: no evaluation in a step, a history that holds less than a step, a

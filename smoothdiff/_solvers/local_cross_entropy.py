@@ -58,29 +58,28 @@ class LocalCrossEntropy(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
        \operatorname{mean}_{i \in E_j} x_{ij}, \;
        \operatorname{rms}_{i \in E_j} (x_{ij} - \mu_j)\right) $$
 
-    One search in one dimension for each parameter; all of them share their evaluations. A
-    population $x_i$ is normal, with mean $\mu$ and spread $s$ of each parameter by itself, and a
-    parameter is judged by the sum of squares of those terms alone that it may move, so that it
-    sees only their noise. The first population is spread evenly over the bounds, wherever the
-    start, so no search begins in a wrong valley, and the answer to a switch is among it. The spread
-    is that around the last mean: a population that still moves stays wide. Only the order of values
-    counts, so jumps, outliers and failed samples do no harm.
+    Each parameter has a search of its own, in one dimension, and all searches share their
+    evaluations. A population $x_i$ is normal, with a mean $\mu$ and a spread $s$ of each parameter. A
+    parameter is judged by the squares of those terms alone that it may move, so it sees only
+    their noise. The first population is spread evenly over the bounds, wherever the start is. So no
+    search begins in a wrong valley, and both answers to a switch are tried. The spread is taken
+    around the last mean: a population that still moves stays wide. Only the order of values counts,
+    so jumps, outliers and failed samples do no harm.
 
-    It pays where a term depends on one parameter or few: switches, texels, cubes that hide one
-    another. Parameters that act together, many on each term, are no coordinates of valleys, and
-    `LocalGaussNewton` needs fewer evaluations then. It is also the more accurate of the two at the
-    end. A step takes n times `num_samples` numbers and no linear algebra.
+    It pays where a term depends on one parameter or a few: switches, texels, cubes that hide one
+    another. Where many parameters act on each term, `LocalGaussNewton` needs fewer evaluations, and
+    is more accurate at the end. A step takes n times `num_samples` numbers and no linear algebra.
 
     Args:
         support: which terms a parameter may influence, as for `LocalGaussNewton`. The residuals
-            are one array whose first axes are those of the terms. For an objective of other terms
-            than squares return their roots: $\sqrt{2 t}$, where $t \ge 0$.
+            are one array whose first axes are those of the terms. If the objective is a sum of
+            terms $t \ge 0$ that are no squares, return $\sqrt{2 t}$.
         sigma: the spread of the first population around the start, a number or a pytree like the
             parameters. By default it covers the bounds, which must be finite then.
-        num_samples: evaluations a step, at least 9: the population, and its mean.
+        num_samples: evaluations a step, at least 9: the population, and one at its mean.
         batch_size: as for `GaussNewton`.
-        nonfinite: "propagate" or "drop" samples that are NaN or infinite. Those that are dropped
-            are the worst; more than half of a population is too many.
+        nonfinite: "propagate" or "drop" samples that are NaN or infinite. Dropped samples count as
+            the worst; more than half of a population is too many.
         rtol: relative tolerance. The run has converged when the spread of three populations in a
             row is below `atol + rtol * norm(y)`. By default both are zero, and the run uses up its
             budget.

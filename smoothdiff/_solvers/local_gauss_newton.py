@@ -70,35 +70,36 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
        G_t = \sum_s N_{ts} R_s R_s^T, \quad g_t = \sum_s N_{ts} R_s m_s $$
 
     The residuals are an array of terms, such as the pixels of a picture or its tiles, and `support`
-    says which of them a parameter may move. Around a term there are few parameters that matter, so
-    a batch M that is small beside all n of them is large there: each term t solves the problem of
-    its neighbourhood in the space of the samples u (M x M numbers), and a parameter takes the mean
-    of what its terms say. R are the residuals of the samples minus their mean m, $N = S S^T$ says
-    how many parameters two terms share, and $\tau$ is the mean of the diagonal of G.
+    says which of them a parameter may move. Few parameters matter to a term. So a batch of M
+    samples, small beside all n parameters, is large beside those few. Each term t solves the
+    problem of its neighbourhood in the space of the samples u (M x M numbers), and a parameter
+    takes the mean of what its terms say. R are the residuals of the samples minus their mean m.
+    $N = S S^T$ counts the parameters that two terms share, and $\tau$ is the mean of the diagonal
+    of G.
 
-    The step is tried with eight dampings $\lambda$, from 30 to 0.01. Then each parameter takes what
-    was best in its own terms, which is tried too, and the best of all nine is the next iterate. So
-    a step may be far from damped in one place and short in another. It is taken even where the
-    iterate was better, as a single point of a rough function is a matter of luck. What is returned
-    is the lowest that was evaluated, or with noise the best of a few by fresh evaluations.
+    The step is tried with eight dampings $\lambda$, from 30 to 0.01. A ninth try takes for each
+    parameter the damping that was best in its own terms. So a step may be long in one place and
+    short in another. The best of the nine is the next iterate, even if the last one was better, as
+    a single point of a rough function is a matter of luck. What is returned is the lowest point
+    that was evaluated, or with noise the best of a few by fresh evaluations.
 
-    `GaussNewton` needs no support, but a time and a memory that grow with the number of parameters
-    times that of residuals. Here M^2 numbers are kept for each term. It runs on CPUs and GPUs; on
-    TPUs JAX has no tridiagonalisation.
+    `GaussNewton` needs no support, but its time and memory grow with the number of parameters times
+    that of residuals. Here M^2 numbers are kept for each term. It runs on CPUs and GPUs; on TPUs
+    JAX lacks a tridiagonalisation.
 
     Args:
         sigma: the smoothing width in the units of the parameters, positive for each of them. A
-            number or a pytree like the parameters adapts: it falls by a tenth in a step as long as
-            the samples' mean sum of squares is more than twice that of the next iterate, and else
-            grows again, so that noise in the residuals keeps it up. While all samples are the same
-            it doubles. An optax schedule is taken as it is.
+            number or a pytree like the parameters adapts. It falls by a tenth in a step if the mean
+            sum of squares of the samples is more than twice that of the next iterate, and grows
+            again if not. So noise in the residuals keeps it up. While all samples are the same it
+            doubles. An optax schedule is followed as it is.
         support: which terms a parameter may influence, as for `smooth`: `local_support`,
             `matrix_support`, `moving_support` or any linear function from parameter-shaped to
             term-shaped arrays with entries 0 and 1. The residuals are one array with the shape of
             the terms; further axes, such as colours, belong to their term.
-        num_samples: evaluations a step, at least 12, nine of which are the ends that are tried. By
-            default up to 96: about n / 2 samples, between 16 and 87, and fewer for more than 760
-            terms, so that a step takes seconds at most (for 65,536 terms 28).
+        num_samples: evaluations a step, at least 12: the samples, and nine ends that are tried. By
+            default about n / 2 samples, between 16 and 87; fewer for more than 760 terms, so that a
+            step takes seconds at most (28 for 65,536 terms).
         sampler: where to sample.
         batch_size: as for `GaussNewton`.
         nonfinite: as for `GaussNewton`. Where all nine ends fail, the iterate stays.

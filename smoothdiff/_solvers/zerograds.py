@@ -58,25 +58,27 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
        \big(h_\phi(\rho_i) - f(\rho_i - \tau_i)\big)^2\Big), \qquad
        y \leftarrow \Pi\big(\text{optax}(\nabla h_\phi(y))\big), $$
 
-    with $\rho \sim \mathcal{N}(y, \sigma^2)$, which keeps the surrogate h local, and $\tau \sim
-    \mathcal{N}(0, \sigma_i^2)$, which smooths the function that it sees. One batch of
-    `num_samples` evaluations a step serves all updates; the noise of a batch changes the weights of
-    the surrogate a little, and the gradient follows from all batches so far. The surrogate sees
-    points in units of sigma from the start, and values in units of their running mean deviation,
-    so a run does not depend on the scale of the function. Candidates for the point returned, beside
-    the lowest that was evaluated, are the last iterate, the one of lowest estimate and the start.
+    Here $\rho \sim \mathcal{N}(y, \sigma^2)$ keeps the surrogate h local, and $\tau \sim
+    \mathcal{N}(0, \sigma_i^2)$ smooths the function that it sees. One batch of `num_samples`
+    evaluations a step serves all updates. A batch changes the weights of the surrogate a little, so
+    the gradient follows from all batches so far, and their noise averages out. The surrogate sees
+    points as distances from the start in units of sigma, and values in units of their running mean
+    deviation. So a run does not depend on the scale of the function. The point returned is the best
+    of these: the lowest that was evaluated, the last iterate, the iterate of lowest estimate, and
+    the start.
 
-    The defaults are the paper's but for the network, `replay` and what goes with it, the rate, the
-    units, and `num_samples` in many dimensions. Its ablations are `inner_sigma=0`
+    The defaults are the paper's, except for the network, `replay` and what goes with it, the rate,
+    the units, and `num_samples` in many dimensions. The paper's ablations are `inner_sigma=0`
     (NoSmooth), `surrogate=smoothdiff.surrogates.Quadratic` (NoNN) and `local=False` (NoLocal).
 
     Args:
         sigma: the width of the neighbourhood in which the surrogate is fitted, the paper's outer
             sigma, in the units of the parameters: a number, a pytree like the parameters, or an
-            optax schedule, a function from the number of the step to a number. The paper has 0.33
-            of the domain, 0.025 for the weights of networks and for textures, and keeps it. With
-            few parameters let it fall, and the rate too, see below: a constant one ends about as
-            far away as it is wide. With many keep it: the surrogate does not learn so fast.
+            optax schedule, a function from the number of the step to a number. The paper keeps it
+            at 0.33 of the domain, or 0.025 for the weights of networks and for textures. With few
+            parameters let it and the rate fall, see `optimizer`: a run with a constant sigma ends
+            about that far from the minimum. With many parameters keep it, as the surrogate does not
+            learn fast enough to follow.
         surrogate: called as `surrogate(size, key=key)`, gives an `eqx.Module` that takes a vector
             of `size` numbers and returns one: `surrogates.MLP`, or with other settings
             `functools.partial(surrogates.MLP, width=32)`. Or a module that is already made.
@@ -86,9 +88,9 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
             many rough steps beat few good ones.
         surrogate_steps: updates of the surrogate for each batch: by default 10 for up to 50
             parameters, 3 beyond, as in the paper.
-        replay: earlier batches that the fit sees again, each sample by the density of the present
-            neighbourhood there over that which drew it, at most one: by default 100 for up to 50
-            parameters, none beyond, as in the paper.
+        replay: how many earlier batches the fit sees again. A sample's weight is the density of the
+            present neighbourhood there over the density that drew it, at most one. By default 100
+            batches for up to 50 parameters, none beyond, as in the paper.
         parameter_steps: updates of the parameters for each batch.
         surrogate_optimizer: an optax transformation for the surrogate's weights.
         optimizer: an optax transformation for the parameters. It may ask for `value`, `grad` and
@@ -97,10 +99,10 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
             paper's are 0.3 % to 0.5 %: slower, and closer in the end. For few parameters and n
             steps, `optax.adam(optax.linear_schedule(0.15 * s, 0.003 * s, n))` goes well with
             `sigma=optax.linear_schedule(s, 0.1 * s, n)`.
-        up_to_constant: fit only how the values of a batch differ from one another, which is all
-            that a gradient needs. By default for more than 50 parameters; for fewer, and in the
-            paper, it is the values themselves, which replayed batches need to tell of curvature.
-        local: with False the surrogate is fitted to all that is within the bounds, uniformly.
+        up_to_constant: fit only the differences between the values of a batch, which are all that a
+            gradient needs. By default for more than 50 parameters. For fewer, and in the paper, the
+            values themselves are fitted: replayed batches need them to tell of curvature.
+        local: with False the surrogate is fitted to points spread evenly over the bounds.
         log: fit the logarithm of the function, which must not be negative.
         sampler: where to sample; a point is $(\rho, \tau)$ as one.
         nonfinite: "propagate" or "drop" samples that are NaN or infinite, as for `smooth`.

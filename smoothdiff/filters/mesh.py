@@ -98,10 +98,10 @@ def mesh_bilateral(
                        {\sum_i \Phi_i (I + \lambda L)^{-1} W_i 1}, \qquad
        W_i = e^{(n \cdot s_i - 1) / \sigma_d}, \quad \Phi_i = e^{(n \cdot s_i - 1) / \sigma_\phi} $$
 
-    n are the normals of the vertices, of the positions that are the guide: sums over the faces at
-    a vertex, weighted by area. s_i are Sobol points on the sphere. All directions and channels are
-    one solve of `mesh_laplacian` with uniform weights. The -1 cancels, and keeps the exponentials
-    from overflowing.
+    n are the normals of the vertices, from the positions that are the guide: sums over the faces at
+    a vertex, weighted by area. s_i are Sobol points on the sphere. All directions and channels
+    together take one solve of `mesh_laplacian` with uniform weights. The -1 cancels, and keeps the
+    exponentials from overflowing.
 
     A vertex also counts itself with a weight of 8 machine epsilons. So it keeps its own value
     where the weights vanish, as they do for scales far below the angles between the directions.
