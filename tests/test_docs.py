@@ -4,9 +4,11 @@ import doctest
 import importlib
 import inspect
 import pkgutil
+import re
 
 import jax
 import pytest
+from pages import ROOT
 
 import smoothdiff as sd
 from smoothdiff.renderers import mitsuba
@@ -64,6 +66,12 @@ def test_what_a_public_name_says(name):
         sections += ["Args", "Returns"] + ["Raises"] * (thing is not mitsuba.available)
     assert [part for part in sections if f"\n{part}:" not in doc] == []
     assert ">>> " in doc[doc.index("\nExample:") :]
+
+
+def test_contributing_says_where_each_module_lives():
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    names = {name.rpartition(".")[2] for name in MODULES}
+    assert [name for name in sorted(names) if not re.search(rf"\b{name}\b", text)] == []
 
 
 @pytest.mark.parametrize("name", TRANSFORMS)

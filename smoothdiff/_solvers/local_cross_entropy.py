@@ -59,8 +59,8 @@ class LocalCrossEntropy(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
        \operatorname{rms}_{i \in E_j} (x_{ij} - \mu_j)\right) $$
 
     Each parameter has a search of its own, in one dimension, and all searches share their
-    evaluations. A population $x_i$ is normal, with a mean $\mu$ and a spread $s$ of each parameter. A
-    parameter is judged by the squares of those terms alone that it may move, so it sees only
+    evaluations. A population $x_i$ is normal, with a mean $\mu$ and a spread $s$ of each parameter.
+    A parameter is judged by the squares of those terms alone that it may move, so it sees only
     their noise. The first population is spread evenly over the bounds, wherever the start is. So no
     search begins in a wrong valley, and both answers to a switch are tried. The spread is taken
     around the last mean: a population that still moves stays wide. Only the order of values counts,
