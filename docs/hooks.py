@@ -11,6 +11,7 @@ from math_core import LatexToMathML
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from nbconvert import MarkdownExporter
+from nbconvert.preprocessors import CoalesceStreamsPreprocessor
 
 import smoothdiff as sd
 
@@ -50,7 +51,9 @@ def made(config: MkDocsConfig, name: str, content: str | bytes) -> File:
 
 def as_pages(path: Path) -> list[tuple[str, str | bytes]]:
     """A notebook as a page, and the pictures in it."""
-    text, resources = MarkdownExporter().from_filename(str(path))
+    # what a cell printed is one block
+    exporter = MarkdownExporter(preprocessors=[CoalesceStreamsPreprocessor])
+    text, resources = exporter.from_filename(str(path))
     text = re.sub(r"\]\(([\w-]+)\.ipynb\)", r"](\1.md)", text)
     folder = f"notebooks/{path.stem}"
     for name in resources["outputs"]:

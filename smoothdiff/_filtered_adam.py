@@ -70,8 +70,9 @@ def scale_by_filtered_adam(
     r"""Adam's scaling with filters in space before and after its averages over time.
 
     $$ g \leftarrow pre(g), \quad m \leftarrow \beta_1 m + (1 - \beta_1) g, \quad
-       v \leftarrow \beta_2 v + (1 - \beta_2) g^2, \quad
-       update = \frac{post(m) / (1 - \beta_1^t)}{\sqrt{post(v) / (1 - \beta_2^t)} + \epsilon} $$
+       v \leftarrow \beta_2 v + (1 - \beta_2) g^2 $$
+
+    $$ update = \frac{post(m) / (1 - \beta_1^t)}{\sqrt{post(v) / (1 - \beta_2^t)} + \epsilon} $$
 
     The parameters guide both filters. Both moments get the same weights, so |post(m)| /
     sqrt(post(v)) is at most the largest |m| / sqrt(v): steps are as bounded as Adam's. Without

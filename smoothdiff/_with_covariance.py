@@ -118,8 +118,10 @@ def _around(
         values, axes = np.linalg.eigh(known.squares[np.ix_(free, free)])
         values = np.maximum(values, np.finfo(float).tiny)
         error = np.sqrt(2 * result.fun / max(size - len(free), 1) / values)
-        farthest = min(_ERRORS + calls, _FARTHEST) * error
-        length = np.clip(balance(known, values), _NEAREST * error, farthest)
+        length = _ERRORS * error
+        if calls:
+            farthest = min(_ERRORS + calls, _FARTHEST) * error
+            length = np.clip(balance(known, values), _NEAREST * error, farthest)
         # neither lost in rounding nor farther than anything that was seen
         length = np.clip(length, np.sqrt(np.finfo(dtype).eps), 1)
         # the same directions again would see the same jumps

@@ -53,8 +53,9 @@ class LocalCrossEntropy(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     r"""Cross-entropy search with local support: many switches or texels at once, over all bounds.
 
     $$ E_j = \{\text{the quarter of all } i \text{ with the lowest }
-       c_{ij} = \textstyle\sum_t S_{tj} \|r_t(x_i)\|^2\}, \qquad
-       (\mu_j, s_j) \leftarrow 0.3 \, (\mu_j, s_j) + 0.7 \, \left(
+       c_{ij} = \textstyle\sum_t S_{tj} \|r_t(x_i)\|^2\} $$
+
+    $$ (\mu_j, s_j) \leftarrow 0.3 \, (\mu_j, s_j) + 0.7 \, \left(
        \operatorname{mean}_{i \in E_j} x_{ij}, \;
        \operatorname{rms}_{i \in E_j} (x_{ij} - \mu_j)\right) $$
 

@@ -66,8 +66,9 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     r"""Nonlinear least squares with local support: thousands of parameters from small batches.
 
     $$ w_t = -(G_t + \lambda \tau_t I)^{-1} g_t, \qquad
-       y_j \leftarrow y_j + \sigma \operatorname{mean}_{t \ni j} (w_t \cdot u_j), \qquad
-       G_t = \sum_s N_{ts} R_s R_s^T, \quad g_t = \sum_s N_{ts} R_s m_s $$
+       y_j \leftarrow y_j + \sigma \operatorname{mean}_{t \ni j} (w_t \cdot u_j) $$
+
+    $$ G_t = \sum_s N_{ts} R_s R_s^T, \qquad g_t = \sum_s N_{ts} R_s m_s $$
 
     The residuals are an array of terms, such as the pixels of a picture or its tiles, and `support`
     says which of them a parameter may move. Few parameters matter to a term. So a batch of M
