@@ -18,7 +18,7 @@ from smoothdiff._result import NO_COVARIANCE, Result, kept_residuals
 from smoothdiff._solvers._random_numbers import keyed
 
 # How far from the answer, in standard errors: to the ends of 95 % intervals, and in further calls
-# farther, where a jump matters less. Where the function curves nearer, but not so near that slopes
+# farther, where a jump matters less, or nearer where the function curves. Not so near that slopes
 # are those of a ripple: an error is about what holds over its own length.
 _ERRORS, _FARTHEST, _NEAREST = 2.0, 4.0, 0.3
 
@@ -28,18 +28,18 @@ def with_covariance(
 ) -> Result:
     r"""The same result with further evaluations around its answer, for its standard errors.
 
-    $$ y \pm c_k \, s v_k / |J v_k|, \qquad 0.3 \le c_k \le 2, \quad k = 1 \dots n $$
+    $$ y \pm c_k \, s v_k / |J v_k|, \qquad 0.3 \le c_k \le 4, \quad k = 1 \dots n $$
 
     `Result.covariance` is free: it makes do with the evaluations of the run. Where those do not
     tell the slopes J at the answer, it is NaN and warns. Then call this. It evaluates the residuals
-    to both sides of the answer along n axes, those of the ellipsoid that the errors are known to
-    have. It looks two standard errors away, and nearer where the residuals curve.
+    to both sides of the answer, two standard errors away, along n axes: those of the ellipsoid that
+    the errors are known to have.
 
-    If some errors are still NaN, call it again. Each further call turns the axes and looks up to
-    four standard errors away, so that jumps average out. It never looks nearer than 0.3 standard
-    errors: on a function with jumps or ripples, slopes over shorter distances give errors that are
-    far too small. What stays NaN is not known to be linear over its own error; profile it with
-    `plot.slice`.
+    While some errors are NaN, call it again. Each further call turns the axes, so that jumps
+    average out. It looks up to four standard errors away, and nearer where the residuals curve, but
+    not nearer than 0.3 standard errors: slopes over shorter distances are those of jumps and
+    ripples, and give errors that are far too small. What stays NaN is not known to be linear over
+    its own error; look at it with `plot.slice`.
 
     Args:
         fun: the residuals, as for `least_squares`.
