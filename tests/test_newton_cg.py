@@ -173,6 +173,16 @@ def test_rosenbrocks_valley_is_followed_to_its_end(seeds, x64):
         assert distance(result.y, 1) < 1e-4, seed
 
 
+@pytest.mark.parametrize("sigma", quick_of([0.03, 0.1, 0.3, 1.0], [0.3]))
+@pytest.mark.parametrize(
+    "start", quick_of([(-1.2, 1), (0, 0), (2, 2), (-2, -1), (0.5, -1.5)], [(0, 0)])
+)
+def test_no_valley_is_taken_for_a_minimum(start, sigma):
+    """Where no evaluation is near, a model can say that it is one; from (0, 0) it was believed."""
+    result = solve(rosenbrock, start, sigma=sigma, max_evaluations=400, dtype=np.float32)
+    assert result.fun < 2e-6
+
+
 @few_seeds
 def test_plateaus_are_crossed_to_the_lowest(seeds, dtype):
     runs = functools.partial(solve, plateaus, (0.0, 0.0), (1.0, 0.6), dtype=dtype)

@@ -1,5 +1,8 @@
 """The quadratic model within a trust region that Newton-CG uses point by point."""
 
+import dataclasses
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -114,6 +117,56 @@ def test_where_the_model_is_flat_the_step_is_for_the_geometry(x64):
     _, proposal, *_ = proposal_of(known(around(7), lambda x: 1.0), radius=0.5)
     assert proposal.reduction[0] == 0
     assert np.linalg.norm(proposal.steps[0]) == pytest.approx(0.5, rel=1e-3)
+
+
+def of_check(trust, proposal, fun, rise):
+    return trust.revise(proposal, fun, jnp.asarray([fun + rise]), jnp.ones(1, bool))
+
+
+def test_a_check_is_where_the_model_knows_least(x64):
+    """Of a plane of points it is off that plane, within the bounds, and promises nothing."""
+    normal = np.array([1.0, 2.0, 2.0]) / 3
+    plane = around(12, 0.3) @ (np.eye(N) - np.outer(normal, normal))
+    history, high = known(plane), jnp.full(N, 0.05)
+    for bounds in (None, (-9 * jnp.ones(N), high)):
+        params = take_apart(jnp.zeros(N), jnp.ones(N), bounds)
+        trust = QuadraticTrust.start(params.sigma, jnp.asarray(0.3))
+        trust = dataclasses.replace(trust, check=jnp.asarray(True))
+        center, _, fun = history.best(jnp.zeros(N))
+        proposal = trust.propose(history, center, fun, params, 1)
+        step = np.asarray(proposal.steps[0])
+        assert proposal.reduction[0] == 0
+        if bounds is None:
+            assert abs(step @ normal) == pytest.approx(0.3, rel=1e-6)
+            # where a model knows nothing, it has not converged
+            assert not of_check(trust, proposal, fun, 1.0).settled
+        else:
+            assert np.all(center + step <= 0.05)
+            assert abs(step @ normal) > 0.2
+        # it neither fails nor is it followed by another
+        after = partial(of_check, trust, proposal, fun)
+        assert (after(1.0).fails, after(1.0).check) == (0, False)
+        assert after(1.0).radius == pytest.approx(0.3)
+
+
+def test_only_a_model_that_is_right_about_a_check_may_have_converged(x64):
+    history = known([*around(10), BEST])
+    trust, _, center, fun = proposal_of(history, radius=0.3)
+    trust = dataclasses.replace(trust, check=jnp.asarray(True))
+    params = take_apart(jnp.zeros(N), jnp.ones(N), None)
+    proposal = trust.propose(history, jnp.asarray(center), jnp.asarray(fun), params, 1)
+    after = partial(of_check, trust, proposal, jnp.asarray(fun))
+    right = [bool(after(share * proposal.rise).settled) for share in (1, 0.7, 0.3, 3, -1)]
+    assert right == [True, True, False, False, False]
+
+
+def test_a_radius_that_is_too_small_for_a_promise_grows():
+    history = known(around(10, 1e-3).astype(np.float32))
+    trust, proposal, _, fun = proposal_of(history, radius=1e-7)
+    assert proposal.tight
+    after = trust.revise(proposal, jnp.asarray(fun), jnp.asarray([fun]), jnp.ones(1, bool))
+    assert after.radius == pytest.approx(2e-7)
+    assert not after.settled
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -25,7 +25,7 @@ from smoothdiff._solvers._base import (
 from smoothdiff._solvers._evaluator import Evaluator, objectives
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import Values, judged, judging
-from smoothdiff._solvers._point_search import AbstractPointSearch, Sizes
+from smoothdiff._solvers._point_search import AbstractPointSearch, Sizes, where
 from smoothdiff._solvers._random_numbers import in_step, takes_key
 
 # by default a search ends after so many evaluations for each parameter, and one, without a lower
@@ -132,6 +132,8 @@ class PointStep(eqx.Module):
         good = jnp.isfinite(funs)
         theta, width = after.iterate(), after.width()
         new_y = params.layout.tree(theta)
+        point, fun = lowest(points, jnp.where(good, funs, jnp.inf))
+        lower = fun < progress.lowest_fun
         with promotion():
             # of steps at several radii the first is that of the model
             moved = solver.norm(params.layout.tree(points[0] - params.theta))
@@ -139,14 +141,16 @@ class PointStep(eqx.Module):
             rounding = math.sqrt(jnp.finfo(theta.dtype).eps) * scale
             small = moved < jnp.maximum(solver.atol + solver.rtol * scale, rounding)
             # a point that only teaches the model is as long as the radius
-            small |= after.done()
+            small |= after.right() & ~lower
             small &= (solver.rtol > 0) | (solver.atol > 0)
             small &= after.settled() & ~after.plateau(_PLATEAU * rounding)
             small &= after.average is None
-        point, fun = lowest(points, jnp.where(good, funs, jnp.inf))
         least = (jnp.minimum(fun, progress.lowest_fun) == 0) & solver.squares
         least &= after.average is None
-        after = after.counted(small, fun < progress.lowest_fun, least, sizes.step)
+        # where a model is wrong, its steps may be short for that: a check comes after the first
+        checks = small & (search.small == 0) & ~after.right()
+        after = after.counted(small, search.checking(), lower, least, sizes.step)
+        after = where(checks, after.checked(), after)
         # the end of a step that is tried may be anything, and so may a place that nobody asked for
         later = state.restarts < solver.restarts
         if solver.nonfinite == "propagate":

@@ -111,8 +111,8 @@ class AbstractPointSearch(eqx.Module):
     def settled(self) -> Bool[Array, ""]:
         """Whether a short step is a sign of convergence."""
 
-    def done(self) -> Bool[Array, ""]:
-        """Whether the model promised no more than rounding may take, whatever the radius.
+    def right(self) -> Bool[Array, ""]:
+        """Whether a model was right about a check where it promised nothing.
 
         Never for residuals: errors of parameters take evaluations around the answer.
         """
@@ -156,9 +156,21 @@ class AbstractPointSearch(eqx.Module):
         """With another center in the mean."""
         return dataclasses.replace(self, average=average)
 
-    def counted(self, small: Array, lower: Array, least: Array, count: int) -> Any:
-        """With a small step more or less, and so many evaluations; `least` is as low as can be."""
-        small = jnp.where(least, _SMALL, jnp.where(small, self.small + 1, 0))
+    def checking(self) -> Bool[Array, ""]:
+        """Whether the next evaluation is no step, but checks the local model."""
+        return jnp.asarray(False)
+
+    def checked(self) -> Any:
+        """With such a check next, if the local model has any."""
+        return self
+
+    def counted(self, small: Array, check: Array, lower: Array, least: Array, count: int) -> Any:
+        """With a small step more or less, and so many evaluations; `least` is as low as can be.
+
+        A `check` that comes true is no step.
+        """
+        small = jnp.where(small, jnp.where(check, self.small, self.small + 1), 0)
+        small = jnp.where(least, _SMALL, small)
         stale = jnp.where(lower, 0, self.stale + count)
         counts = self.evaluated + count, small, stale
         return eqx.tree_at(lambda s: (s.evaluated, s.small, s.stale), self, counts)

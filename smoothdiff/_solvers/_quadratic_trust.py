@@ -1,11 +1,10 @@
 r"""Newton steps within a trust region, one evaluation a step: while a quadratic model predicts.
 
-Around the best point the function is modelled as $f + g \cdot u + \tfrac12 u \cdot H u$. The model
-interpolates the nearest evaluations, and its Hessian differs least, in Frobenius norm, from the
-last one. So 2 n + 1 evaluations are enough to begin with. The coordinates u are those in which the
-Hessian is round, as far as it is known: a narrow valley is as easy as a bowl.
+Around the best point the function is modelled as $f + g \cdot u + \tfrac12 u \cdot H u$, in the
+coordinates u in which the Hessian is round, as far as it is known: a narrow valley is as easy as a
+bowl. After a short step comes a point that checks the model, see there.
 
-Source: the least change is Powell's (2004; NEWUOA, BOBYQA); the metric and the weights are our own.
+Source: the metric is our own.
 """
 
 from typing import NamedTuple
@@ -19,18 +18,12 @@ from smoothdiff._params import Params
 from smoothdiff._solvers._base import all_finite, dot
 from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._history import History
+from smoothdiff._solvers._least_change import least_change
 from smoothdiff._solvers._metric import Metric
+from smoothdiff._solvers._model_check import check_step, is_right
 from smoothdiff._solvers._point_search import nothing, powers_of_two
 from smoothdiff._solvers._ratio_test import asks_nothing, ratio_test, settled
 
-# the most evaluations that a model interpolates, if n parameters do not need more
-_MOST = 256
-# how far they may be, in radii of the region or of the nearest 2 n + 1 of them
-_FARTHEST = 3.0
-# evaluations higher than so many times the median are interpolated less and less exactly
-_HIGH, _HIGHEST = 3.0, 1e6
-# the errors of the others, against the squared distances
-_RIDGE = {"float32": 1e-7, "float64": 1e-12}
 # an evaluation so many radii away should make way for a nearer one
 _FAR = 2.0
 # so many steps that fail in a row are too many for now, and so many evaluations for each parameter,
@@ -41,32 +34,37 @@ _FAILS, _SLOW = 5, 10
 class Proposal(NamedTuple):
     """Steps to evaluate, in units of the metric, and what the model says of them.
 
-    It is `done` where it promises no more than rounding may take, whatever the radius.
+    The first may be a `check` that the function rises there as predicted. The radius is `tight`
+    where the model promises no more within it than rounding may take, but may beyond.
     """
 
     steps: Float[Array, "K n"]
     reduction: Float[Array, " K"]
     hessian: Float[Array, "n n"]
     poor: Bool[Array, ""]
-    done: Bool[Array, ""]
+    check: Bool[Array, ""]
+    rise: Float[Array, ""]
+    tight: Bool[Array, ""]
 
 
 class QuadraticTrust(eqx.Module):
     """How far the model is trusted, in units of the metric, and the Hessian of the last model.
 
-    `improve` says that the next evaluation is for the geometry of the points, not for a step;
-    `fails` counts the steps in a row that failed, `slow` the evaluations without a lower point.
-    The last step may be `settled`, see there, and the model `done`.
+    The next evaluation is no step where it is to `improve` the geometry of the points, or to
+    `check` the model. `fails` counts the steps in a row
+    that failed, `slow` the evaluations without a lower point. The last step may be `settled`, see
+    there, and the model `right` about a check.
     """
 
     metric: Metric
     radius: Float[Array, ""]
     hessian: Float[Array, "n n"]
     improve: Bool[Array, ""]
+    check: Bool[Array, ""]
     fails: Int[Array, ""]
     slow: Int[Array, ""]
     settled: Bool[Array, ""]
-    done: Bool[Array, ""]
+    right: Bool[Array, ""]
 
     @staticmethod
     def start(sigma: Float[Array, " n"], radius: Float[Array, ""]) -> "QuadraticTrust":
@@ -74,7 +72,7 @@ class QuadraticTrust(eqx.Module):
         n, none = len(sigma), jnp.zeros((), jnp.int32)
         hessian = jnp.zeros((n, n), sigma.dtype)
         no = jnp.asarray(False)
-        return QuadraticTrust(Metric.of(sigma, True), radius, hessian, no, none, none, no, no)
+        return QuadraticTrust(Metric.of(sigma, True), radius, hessian, no, no, none, none, no, no)
 
     def failed(self) -> Bool[Array, ""]:
         """Whether the model is of no use here, or nothing is left to do for it."""
@@ -85,6 +83,10 @@ class QuadraticTrust(eqx.Module):
         """Whether the model has not predicted for a while; a smaller radius may yet help."""
         return (self.fails >= _FAILS) | self.failed()
 
+    def teaches(self) -> Bool[Array, ""]:
+        """Whether the next evaluation is no step, but to make the model better."""
+        return self.improve | self.check
+
     def retried(self) -> "QuadraticTrust":
         """With the radius as it is, and the failed steps forgotten."""
         return eqx.tree_at(lambda t: t.fails, self, jnp.zeros_like(self.fails))
@@ -93,7 +95,7 @@ class QuadraticTrust(eqx.Module):
         """Trusted again, at least as far as this, around another point."""
         none = jnp.zeros_like(self.fails)
         radius, no = jnp.maximum(self.radius, radius), jnp.zeros_like(self.improve)
-        return QuadraticTrust(self.metric, radius, self.hessian, no, none, none, no, no)
+        return QuadraticTrust(self.metric, radius, self.hessian, no, no, none, none, no, no)
 
     def propose(
         self,
@@ -103,83 +105,45 @@ class QuadraticTrust(eqx.Module):
         params: Params,
         count: int,
     ) -> Proposal:
-        """Minimisers of the model within this radius and others, or a point for the geometry."""
-        grad, hessian, (constant, slope, bend), poor, rise = self._fit(history, center, fun)
+        """Minimisers of the model within this radius and others, or a point that teaches it."""
+        model = least_change(history, center, fun, self.metric, self.radius, self.hessian)
+        grad, hessian, (constant, slope, bend) = model.grad, model.hessian, model.polynomial
 
         def minimiser(hessian: Array, grad: Array, radius: Array) -> Array:
             return self._within_bounds(hessian, grad, radius, center, params)
 
         radii = self.radius * powers_of_two(count, fun.dtype)
         steps = jax.vmap(lambda radius: minimiser(hessian, grad, radius))(radii)
-        reduction = -(dot(steps, grad) + jnp.sum(dot(steps, hessian) * steps, axis=1) / 2)
-        # where the model asks for nothing, a point that teaches it something: one of the two ends
-        # of what the farthest evaluation determines alone
-        done, nothing = asks_nothing(reduction[0], fun, rise, steps[0], self.radius)
-        improve = self.improve | nothing
+        change = lambda steps, slope, bend: (
+            dot(steps, slope) + jnp.sum(dot(steps, bend) * steps, axis=1) / 2
+        )
+        reduction = -change(steps, grad, hessian)
+        asked = asks_nothing(reduction[0], fun, model.highest, steps[0], self.radius)
+        # where the model asks for nothing, a point that teaches it something
+        check = self.check | (asked.nothing & ~self.improve)
 
         def other() -> Array:
+            """One of the two ends of what the farthest evaluation determines alone."""
             ends = jnp.stack([minimiser(s * bend, s * slope, self.radius) for s in (1, -1)])
-            moved = dot(ends, slope) + jnp.sum(dot(ends, bend) * ends, axis=1) / 2
-            return ends[jnp.argmax(jnp.abs(constant + moved))]
+            return ends[jnp.argmax(jnp.abs(constant + change(ends, slope, bend)))]
 
-        first = jax.lax.cond(improve, other, lambda: steps[0])
+        def checked() -> Array:
+            """One of the two ends of a check, within the bounds: the lower one."""
+            check = check_step(model, self.metric, center, fun, steps[0], self.radius)
+            ends = jnp.stack([check, -check])
+            inside = jax.vmap(params.clip)(center[None] + self.metric.out(ends))
+            ends = self.metric.into(inside - center[None])
+            length = jnp.linalg.norm(ends, axis=1)
+            short = length < jnp.max(length) / 2
+            return ends[jnp.argmin(jnp.where(short, jnp.inf, change(ends, grad, hessian)))]
+
+        which = jnp.where(check, 2, self.improve.astype(jnp.int32))
+        first = jax.lax.switch(which, [lambda: steps[0], other, checked])
+        rise = change(first[None], grad, hessian)[0]
         steps = steps.at[0].set(first)
-        reduction = reduction.at[0].set(jnp.where(improve, 0, reduction[0]))
-        return Proposal(steps, reduction, hessian, poor, done)
-
-    def _fit(
-        self, history: History, center: Array, fun: Array
-    ) -> tuple[Array, Array, tuple[Array, Array, Array], Array, Array]:
-        """Gradient and Hessian; the polynomial of the farthest point, and whether that is too far.
-
-        The polynomial is 1 there and 0 at the other points, as far as they are interpolated. Last
-        comes by how much the highest of them is above the center.
-        """
-        n, dtype = len(center), fun.dtype
-        tiny = jnp.finfo(dtype).tiny
-        away = self.metric.into(history.points - center[None])
-        length = jnp.linalg.norm(away, axis=1)
-        # steps below rounding come back to the center, which once is enough of
-        again = history.valid & (length == 0) & (history.funs == fun)
-        again &= jnp.arange(len(away)) != jnp.argmax(again)
-        everywhere = jnp.where(history.valid & ~again, length, jnp.inf)
-        count = max(min((n + 1) * (n + 2) // 2, _MOST), 2 * n + 1)
-        nearest, near = jax.lax.top_k(-jnp.asarray(everywhere), min(count, len(away)))
-        distance = -jnp.asarray(nearest)
-        close = distance[: 2 * n + 1]
-        spread = jnp.max(jnp.where(jnp.isfinite(close), close, 0))
-        reach = jnp.maximum(self.radius, spread)
-        used = distance <= _FARTHEST * reach
-        # so that the kernel is about 1, beside which the errors are small
-        width = jnp.minimum(reach, jnp.max(jnp.where(used, distance, 0))) + tiny
-        a = jnp.where(used[:, None], away[near], 0) / width
-        rise = jnp.where(used, history.funs[near] - fun, 0)
-        typical = jnp.nanmedian(jnp.where(used, jnp.abs(rise), jnp.nan))
-        high, highest = _HIGH * typical + tiny, jnp.max(rise)
-        above = jnp.clip(rise / high, 1, _HIGHEST)
-        rise = jnp.minimum(rise, _HIGHEST * high)
-
-        old = self.hessian * width**2
-        error = jnp.where(used, _RIDGE[dtype.name] * above**2, 1)
-        borders = jnp.concatenate([used[:, None].astype(dtype), a], axis=1)
-        corner = -jnp.finfo(dtype).eps * jnp.eye(n + 1, dtype=dtype)
-        kernel = dot(a, a.T) ** 2 / 2 + jnp.diag(error)
-        system = jnp.block([[kernel, borders], [borders.T, corner]])
-        farthest = jnp.argmax(jnp.where(used, distance, -1))
-        left = rise - jnp.sum(dot(a, old) * a, axis=1) / 2
-        sides = jnp.stack([jnp.where(used, left, 0), jnp.eye(len(a), dtype=dtype)[farthest]])
-        sides = jnp.pad(sides, ((0, 0), (0, n + 1)))
-        factor = jax.scipy.linalg.lu_factor(system)
-        solved = jax.scipy.linalg.lu_solve(factor, sides.T)
-        # once more for what rounding left, which is much in float32
-        solved += jax.scipy.linalg.lu_solve(factor, sides.T - dot(system, solved))
-        solved = solved.T
-        solved = jnp.asarray(jnp.where(jnp.all(jnp.isfinite(solved)), solved, 0))
-        bends = [dot(a.T * weights[None], a) for weights in solved[:, : len(a)]]
-        constants, slopes = solved[:, len(a)], solved[:, len(a) + 1 :] / width
-        polynomial = constants[1], slopes[1], bends[1] / width**2
-        poor = (distance[farthest] > _FAR * self.radius) & (jnp.sum(used) > n + 1)
-        return slopes[0], (old + bends[0]) / width**2, polynomial, poor, highest
+        reduction = reduction.at[0].set(jnp.where(which > 0, 0, reduction[0]))
+        poor = (model.farthest > _FAR * self.radius) & (model.used > len(center) + 1)
+        return Proposal(steps, reduction, hessian, poor, check, rise, asked.tight)
 
     def _within_bounds(
         self, hessian: Array, grad: Array, radius: Array, center: Array, params: Params
@@ -217,7 +181,7 @@ class QuadraticTrust(eqx.Module):
         )
         length = jnp.linalg.norm(turn.into(proposal.steps[best]))
         outcome = ratio_test(before, fun, reduction, self.fails)
-        tried, failed, held, long, fails, _ = outcome
+        _, failed, held, long, fails, _ = outcome
         radii = self.radius * powers_of_two(len(funs), length.dtype)
         # in the units that the step was made in
         moved = jnp.linalg.norm(proposal.steps[best])
@@ -226,14 +190,18 @@ class QuadraticTrust(eqx.Module):
         lower = jnp.minimum(self.radius, length) * jnp.where(long, 0.1, 0.5)
         radius = jnp.where(failed & ~wait, lower, self.radius)
         radius = jnp.where(held, jnp.maximum(radius, 2 * length), radius)
-        radius = jnp.where(~tried & ~self.improve, self.radius / 2, radius)
+        radius = jnp.where(proposal.tight & ~self.teaches(), 2 * self.radius, radius)
+        # a check is no step, but a model that is right about it may have converged
+        right = proposal.check & is_right(before, funs[0], proposal.rise)
+        ends = settled(self.settled, outcome, moved, radii[best])
         return QuadraticTrust(
             metric=metric,
             radius=radius,
             hessian=turn.out(turn.out(hessian).T),
             improve=failed & proposal.poor,
+            check=jnp.zeros_like(self.check),
             fails=fails,
             slow=jnp.where(fun < before, 0, self.slow + len(funs)).astype(fails.dtype),
-            settled=settled(self.settled, outcome, moved, radii[best]),
-            done=proposal.done,
+            settled=jnp.where(proposal.check, right, ends),
+            right=right,
         )

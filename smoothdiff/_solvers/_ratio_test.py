@@ -31,6 +31,17 @@ class Outcome(NamedTuple):
     more: Bool[Array, ""]
 
 
+class Asked(NamedTuple):
+    """Whether the radius is `tight`, and whether there is `nothing` to try within it.
+
+    The radius is tight where no step within it promises more than rounding takes, but a longer one
+    may, or where the model cannot know.
+    """
+
+    tight: Bool[Array, ""]
+    nothing: Bool[Array, ""]
+
+
 def ratio_test(
     before: Float[Array, ""],
     fun: Float[Array, ""],
@@ -70,7 +81,7 @@ def settled(
     promised more than rounding may take, as where a function jumps.
     """
     worked = outcome.tried & ~outcome.failed
-    inside = ~outcome.more | (length < _INSIDE * radius)
+    inside = (length < _INSIDE * radius) | ~(outcome.more | worked)
     return inside & (before | worked) & ~(outcome.failed & outcome.more)
 
 
@@ -80,12 +91,11 @@ def asks_nothing(
     rise: Float[Array, ""],
     step: Float[Array, " n"],
     radius: Float[Array, ""],
-) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-    """Whether a model is done, and whether it has nothing to try within the radius.
+) -> Asked:
+    """Whether a model has anything to try.
 
-    It is done where no step, however long, promises more than rounding takes. A model knows that
-    only if its values rise by far more than rounding. And the radius must not be too small for a
-    promise, as it can be where the function is large.
+    A model knows that it has not only if its values rise by far more than rounding. And the radius
+    must not be too small for a promise, as it can be where the function is large.
 
     Args:
         reduction: what the step promises.
@@ -95,6 +105,7 @@ def asks_nothing(
         radius: that of the trust region.
     """
     unit = jnp.finfo(fun.dtype).eps * jnp.abs(fun)
-    done = ~(reduction > _NOTHING * unit) & (rise > _TELLING * unit)
-    done &= jnp.linalg.norm(step) < _INSIDE * radius
-    return done, done | ~(reduction > unit)
+    little = ~(reduction > _NOTHING * unit)
+    inside = jnp.linalg.norm(step) < _INSIDE * radius
+    done = little & (rise > _TELLING * unit) & inside
+    return Asked(little & ~done, done | ~(reduction > unit))

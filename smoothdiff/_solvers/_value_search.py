@@ -141,9 +141,17 @@ class ValueSearch(AbstractPointSearch):
         """The local model's may be none."""
         return ~self.is_local() | self.trust.settled
 
-    def done(self) -> Bool[Array, ""]:
-        """Whether that is the local model."""
-        return self.is_local() & self.trust.done
+    def checking(self) -> Bool[Array, ""]:
+        """Only the local model is checked."""
+        return self.is_local() & self.trust.check
+
+    def checked(self) -> "ValueSearch":
+        """With a check as the local model's next point."""
+        return eqx.tree_at(lambda s: s.trust.check, self, self.is_local())
+
+    def right(self) -> Bool[Array, ""]:
+        """Whether that was the local model."""
+        return self.is_local() & self.trust.right
 
     def lost(self, sizes: Sizes) -> Bool[Array, ""]:
         """Whether neither model leads anywhere; after one converged the wide one may yet."""
@@ -190,7 +198,9 @@ class ValueSearch(AbstractPointSearch):
             reduction=jnp.zeros(count, self.start.dtype),
             hessian=self.trust.hessian,
             poor=jnp.asarray(False),
-            done=jnp.asarray(False),
+            check=jnp.asarray(False),
+            rise=jnp.zeros((), self.start.dtype),
+            tight=jnp.asarray(False),
         )
 
         def first() -> tuple[Array, Proposal]:
@@ -288,6 +298,8 @@ class ValueSearch(AbstractPointSearch):
         # values with other keys are not to be compared, nor is how fast they fell
         compared = turn.over() & (self.average is None)
         ended = (compared | stuck | (~local & self.center.lost(sizes))) & ~self._later()
+        # a model about to converge goes on
+        ended &= ~(local & (self.small > 0))
 
         # what one has found the other begins with, unless it found little
         revive = ~local & lower & self.trust.stuck()

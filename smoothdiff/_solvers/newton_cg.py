@@ -40,7 +40,8 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     - a local one, around the best point. It interpolates the nearest evaluations, and its Hessian
       differs least from the last one. The step that minimises it within the trust region is one
       evaluation; the radius $\Delta$ grows where the function falls as predicted and shrinks where
-      it does not.
+      it does not. After a short step one evaluation checks the model: a little farther away, in a
+      flat direction that no other point tells of.
     - a wide one, for functions that jump, have noise or many minima: a regression over samples
       around a center, which gives the smoothed value, gradient and Hessian-vector products in
       closed form, with standard errors. A truncated conjugate-gradient method minimises it. What is
@@ -74,9 +75,11 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
             or "drop" it.
         rtol: relative tolerance. The run has converged when three steps in a row are below
             `atol + rtol * max(norm(y), norm(sigma))`, unless only the radius made them short, or
-            they failed where the model promised more than rounding may take. A point counts as a
-            small step if the model promises no more than rounding takes. If other searches are to
-            follow, a search goes on until its patience ends: its wide samples may find more.
+            they failed where the model promised more than rounding may take. After the first of
+            the three one evaluation checks the model; it must rise about as predicted. A point
+            counts as a small step if the model promises no more than rounding takes. If other
+            searches are to follow, a search goes on until its patience ends: its wide samples may
+            find more.
         atol: absolute tolerance. With both zero no run converges; else the tolerance is at least
             the root of the rounding of `max(norm(y), norm(sigma))`.
         norm: the norm of steps and iterates.

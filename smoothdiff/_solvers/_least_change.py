@@ -1,0 +1,115 @@
+r"""The quadratic that interpolates evaluations, and whose Hessian differs least from the last one.
+
+$$ \min_{g, H} \|H - H_0\|_F, \qquad g \cdot a_i + \tfrac12 a_i \cdot H a_i = f_i - f $$
+
+So 2 n + 1 evaluations are enough to begin with; (n + 1)(n + 2) / 2 determine a quadratic.
+
+Source: Powell 2004 (NEWUOA, BOBYQA); the errors of points that are high are our own.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from smoothdiff._solvers._base import dot
+from smoothdiff._solvers._history import History
+from smoothdiff._solvers._metric import Metric
+
+# the most evaluations that are interpolated, if n parameters do not need more
+_MOST = 256
+# how far they may be, in radii of the region or of the nearest 2 n + 1 of them
+_FARTHEST = 3.0
+# evaluations higher than so many times the median are interpolated less and less exactly
+_HIGH, _HIGHEST = 3.0, 1e6
+# the errors of the others, against the squared distances
+_RIDGE = {"float32": 1e-7, "float64": 1e-12}
+
+
+class Quadratic(NamedTuple):
+    """The gradient and the Hessian at the center, in units of the metric.
+
+    The polynomial, a constant, a slope and a bend, is 1 at the farthest point, which is so far
+    away, and 0 at the other points, as far as they are interpolated. The highest of the `used`
+    points is so far above the center. They are so far `away`, the others at the center.
+    """
+
+    grad: Float[Array, " n"]
+    hessian: Float[Array, "n n"]
+    polynomial: tuple[Float[Array, ""], Float[Array, " n"], Float[Array, "n n"]]
+    farthest: Float[Array, ""]
+    used: Float[Array, ""]
+    highest: Float[Array, ""]
+    away: Float[Array, "m n"]
+
+
+def least_change(
+    history: History,
+    center: Float[Array, " n"],
+    fun: Float[Array, ""],
+    metric: Metric,
+    radius: Float[Array, ""],
+    before: Float[Array, "n n"],
+) -> Quadratic:
+    """The quadratic around the center, where the function has that value.
+
+    Args:
+        history: what was evaluated.
+        center: the point around which it is, one that was evaluated.
+        fun: the value there.
+        metric: the coordinates, in which the points nearest to the center are chosen.
+        radius: where the quadratic is to hold, in these coordinates.
+        before: the Hessian that changes least, in these coordinates.
+    """
+    n, dtype = len(center), fun.dtype
+    tiny = jnp.finfo(dtype).tiny
+    away = metric.into(history.points - center[None])
+    length = jnp.linalg.norm(away, axis=1)
+    # steps below rounding come back to the center, which once is enough of
+    again = history.valid & (length == 0) & (history.funs == fun)
+    again &= jnp.arange(len(away)) != jnp.argmax(again)
+    everywhere = jnp.where(history.valid & ~again, length, jnp.inf)
+    count = max(min((n + 1) * (n + 2) // 2, _MOST), 2 * n + 1)
+    nearest, near = jax.lax.top_k(-jnp.asarray(everywhere), min(count, len(away)))
+    distance = -jnp.asarray(nearest)
+    close = distance[: 2 * n + 1]
+    spread = jnp.max(jnp.where(jnp.isfinite(close), close, 0))
+    reach = jnp.maximum(radius, spread)
+    used = distance <= _FARTHEST * reach
+    # so that the kernel is about 1, beside which the errors are small
+    width = jnp.minimum(reach, jnp.max(jnp.where(used, distance, 0))) + tiny
+    a = jnp.where(used[:, None], away[near], 0) / width
+    rise = jnp.where(used, history.funs[near] - fun, 0)
+    typical = jnp.nanmedian(jnp.where(used, jnp.abs(rise), jnp.nan))
+    high, highest = _HIGH * typical + tiny, jnp.max(rise)
+    above = jnp.clip(rise / high, 1, _HIGHEST)
+    rise = jnp.minimum(rise, _HIGHEST * high)
+
+    old = before * width**2
+    error = jnp.where(used, _RIDGE[dtype.name] * above**2, 1)
+    borders = jnp.concatenate([used[:, None].astype(dtype), a], axis=1)
+    corner = -jnp.finfo(dtype).eps * jnp.eye(n + 1, dtype=dtype)
+    kernel = dot(a, a.T) ** 2 / 2 + jnp.diag(error)
+    system = jnp.block([[kernel, borders], [borders.T, corner]])
+    farthest = jnp.argmax(jnp.where(used, distance, -1))
+    left = rise - jnp.sum(dot(a, old) * a, axis=1) / 2
+    sides = jnp.stack([jnp.where(used, left, 0), jnp.eye(len(a), dtype=dtype)[farthest]])
+    sides = jnp.pad(sides, ((0, 0), (0, n + 1)))
+    factor = jax.scipy.linalg.lu_factor(system)
+    solved = jax.scipy.linalg.lu_solve(factor, sides.T)
+    # once more for what rounding left, which is much in float32
+    solved += jax.scipy.linalg.lu_solve(factor, sides.T - dot(system, solved))
+    solved = solved.T
+    solved = jnp.asarray(jnp.where(jnp.all(jnp.isfinite(solved)), solved, 0))
+    bends = [dot(a.T * weights[None], a) for weights in solved[:, : len(a)]]
+    constants, slopes = solved[:, len(a)], solved[:, len(a) + 1 :] / width
+    return Quadratic(
+        grad=slopes[0],
+        hessian=(old + bends[0]) / width**2,
+        polynomial=(constants[1], slopes[1], bends[1] / width**2),
+        farthest=distance[farthest],
+        used=jnp.sum(used),
+        highest=highest,
+        away=jnp.where(used[:, None], away[near], 0),
+    )

@@ -1,0 +1,70 @@
+r"""A check of a quadratic model before its short steps are believed.
+
+Where no evaluation is near, a model can take the center for the minimum that is elsewhere. Let that
+be a distance $\delta$ away, along a direction in which the curvature is h. Then the function rises
+over a distance d by $h d (d / 2 \pm \delta)$, and not by the $h d^2 / 2$ of the model. So one
+evaluation tells whether $\delta$ is small against d. The direction is a flat one, since an error of
+the gradient moves the minimum most there, unless a point about as near is known.
+
+Source: our own; the criticality step of Conn, Scheinberg and Vicente 2009 has the same purpose.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from smoothdiff._solvers._base import dot
+from smoothdiff._solvers._least_change import Quadratic
+from smoothdiff._solvers._metric import Metric
+
+# the check is so many steps away
+_STEPS = 10.0
+# the rise that is predicted is about so many roundings of the value, or more
+_TELLING = 1000
+# a rise that is so many times higher or lower than predicted is right
+_RIGHT = 2.0
+
+
+def check_step(
+    model: Quadratic,
+    metric: Metric,
+    center: Float[Array, " n"],
+    fun: Float[Array, ""],
+    step: Float[Array, " n"],
+    radius: Float[Array, ""],
+) -> Float[Array, " n"]:
+    """From the center to the check, in units of the metric; the opposite is as good.
+
+    Args:
+        model: what is to be checked.
+        metric: its units.
+        center: where it says the minimum is.
+        fun: the value there.
+        step: the short step, in units of the metric.
+        radius: that of the trust region, beyond which there is no check.
+    """
+    eps, tiny = jnp.finfo(fun.dtype).eps, jnp.finfo(fun.dtype).tiny
+    curvatures, vectors = jnp.linalg.eigh(model.hessian)
+    mean = jnp.mean(jnp.abs(curvatures)) + tiny
+
+    def far_enough(curvature: Array) -> Array:
+        rise = _TELLING * eps * jnp.abs(fun)
+        return jnp.sqrt(2 * rise / (jnp.abs(curvature) + tiny))
+
+    # the largest parameter moves by the root of its rounding, or more
+    least = jnp.sqrt(eps) * jnp.max(jnp.abs(center)) / metric.widest()
+    length = jnp.maximum(jnp.maximum(_STEPS * jnp.linalg.norm(step), least), tiny)
+    away = model.away / jnp.minimum(jnp.maximum(length, far_enough(mean)), radius)
+    # a point that is about as far away tells as much of its direction as curvature would
+    told = 2 * away / (1 + jnp.sum(away**2, axis=1, keepdims=True))
+    flat = dot(vectors * jnp.minimum(jnp.abs(curvatures) / mean, 1)[None], vectors.T)
+    direction = jnp.linalg.eigh(flat + dot(told.T, told))[1][:, 0]
+    curvature = dot(direction, dot(model.hessian, direction))
+    return jnp.minimum(jnp.maximum(length, far_enough(curvature)), radius) * direction
+
+
+def is_right(
+    before: Float[Array, ""], fun: Float[Array, ""], rise: Float[Array, ""]
+) -> Bool[Array, ""]:
+    """Whether the function rises about as the model predicts, by enough to tell."""
+    about = (fun - before > rise / _RIGHT) & (fun - before < rise * _RIGHT)
+    return about & (rise > _TELLING / 2 * jnp.finfo(fun.dtype).eps * jnp.abs(before))
