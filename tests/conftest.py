@@ -12,6 +12,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import jax
 import pytest
 
+from smoothdiff._jaxlib import take_threads
+
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
@@ -58,6 +60,7 @@ def pytest_configure(config):
         for name, value in CACHE.items():
             os.environ[f"JAX_PERSISTENT_CACHE_{name.upper()}"] = value
         os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
+        take_threads()
         if "XLA_FLAGS" not in os.environ and knows(FLAGS):
             os.environ["XLA_FLAGS"] = FLAGS
     # of tests in the first process, which has imported JAX before

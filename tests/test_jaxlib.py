@@ -1,5 +1,6 @@
 """What is said of versions of jaxlib that can hang, and that our own programs keep clear of it."""
 
+import os
 import re
 import warnings
 from collections import Counter
@@ -11,9 +12,12 @@ import pytest
 import smoothdiff as sd
 from smoothdiff import _jaxlib
 
+LAPACK = "triangular_solve|cholesky|geqrf|householder_product|lu"
 
-def warned(monkeypatch, version, plugin=False, platforms=None):
+
+def warned(monkeypatch, version, plugin=False, platforms=None, nproc="2"):
     monkeypatch.setattr(_jaxlib, "_JAXLIB", version)
+    monkeypatch.setenv("NPROC", nproc)
     monkeypatch.setattr(_jaxlib, "_ACCELERATORS", ("json",) if plugin else ("no_such_plugin",))
     with warnings.catch_warnings(record=True) as caught, jax_platforms(platforms):
         warnings.simplefilter("always")
@@ -52,6 +56,25 @@ def test_no_warning_where_jax_runs_elsewhere(monkeypatch):
     assert warned(monkeypatch, "0.10.2", platforms="cuda,cpu") == 0
 
 
+def test_no_warning_where_xla_has_many_threads(monkeypatch):
+    assert warned(monkeypatch, "0.10.2", nproc="32") == 0
+    cores = set(range(64))
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: cores, raising=False)
+    assert warned(monkeypatch, "0.10.2", nproc="") == 0
+    cores -= set(range(60))
+    assert warned(monkeypatch, "0.10.2", nproc="") == 1
+
+
+def test_programs_of_this_repository_take_threads_where_they_are_needed(monkeypatch):
+    for version, nproc in (("0.9.2", None), ("0.10.2", "32")):
+        monkeypatch.setattr(_jaxlib, "_JAXLIB", version)
+        monkeypatch.setattr(_jaxlib, "_ACCELERATORS", ("no_such_plugin",))
+        monkeypatch.setenv("NPROC", "")  # so that it is as it was in the end
+        monkeypatch.delenv("NPROC")
+        _jaxlib.take_threads()
+        assert os.environ.get("NPROC") == nproc
+
+
 @pytest.mark.parametrize("baseline", ["linear", "quadratic", sd.GaussianProcess()], ids=str)
 def test_a_fit_to_several_outputs_has_one_solve(baseline):
     """Several that do not depend on each other can hang under vmap with some versions of jaxlib."""
@@ -62,6 +85,6 @@ def test_a_fit_to_several_outputs_has_one_solve(baseline):
     def solves(fun):
         g = sd.smooth(fun, 0.1, num_samples=64, baseline=baseline)
         text = str(jax.make_jaxpr(g)(jax.random.key(0), jnp.ones(2)))
-        return Counter(re.findall("triangular_solve|cholesky|geqrf|householder_product| lu", text))
+        return Counter(re.findall(rf"= ({LAPACK})\b", text))
 
     assert solves(fun) == solves(lambda x: jnp.sum(jnp.abs(x))) != {}
