@@ -14,6 +14,7 @@ from jaxtyping import PyTree
 from smoothdiff._executors import InTurn, engine
 from smoothdiff._host_calls import HostFunction
 from smoothdiff._host_samples import BlackBoxError, Samples, wait_for
+from smoothdiff._numbers import check_whole
 from smoothdiff._outputs import Outputs
 from smoothdiff._params import is_concrete
 from smoothdiff._reraise import reraise, was_raised
@@ -282,5 +283,6 @@ def _check(host: HostFunction, store: Any) -> None:
         )
     if host.timeout is not None and not host.timeout > 0:
         raise ValueError(f"timeout must be a positive number of seconds, not {host.timeout!r}")
+    check_whole(host.retries, "retries")
     if host.retries < 0:
         raise ValueError(f"retries must be 0 (a single try) or more, not {host.retries!r}")

@@ -199,8 +199,9 @@ def _positive(value: Any, name: str) -> int:
         number = operator.index(value)
     except TypeError:
         number = 0
-    if number < 1:
-        raise ValueError(f"{name} must be a positive integer, not {value!r}")
+    if not 1 <= number < 2**31:
+        least = "a positive integer" if number < 1 else "less than 2**31"
+        raise ValueError(f"{name} must be {least}, not {value!r}")
     return number
 
 

@@ -9,6 +9,8 @@ import numpy as np
 import optax
 from jaxtyping import Array, PyTree
 
+from smoothdiff._numbers import check_real
+from smoothdiff._params import check_pair, like
 from smoothdiff._solvers import (
     FirstOrder,
     GaussNewton,
@@ -50,10 +52,13 @@ def default_solver(
     usual = default_sigma(y, bounds)
     if sigma is None:
         sigma = usual
-    elif any(width is None for width in jax.tree.leaves(sigma, is_leaf=_is_none)):
-        # what a space says nothing of
-        full = jax.tree.broadcast(sigma, y, is_leaf=_is_none)
-        sigma = jax.tree.map(lambda s, d: d if s is None else s, full, usual, is_leaf=_is_none)
+    elif not callable(sigma):
+        full = like(sigma, y, "sigma")
+        # as floats, as JAX has no integers of any size
+        sigma = jax.tree.map(lambda s: float(s) if type(s) is int else s, sigma, is_leaf=_is_none)
+        if any(width is None for width in jax.tree.leaves(sigma, is_leaf=_is_none)):
+            # what a space says nothing of
+            sigma = jax.tree.map(lambda s, d: d if s is None else s, full, usual, is_leaf=_is_none)
     if residuals:
         if support is None:
             return GaussNewton(sigma)
@@ -68,10 +73,16 @@ def default_solver(
 
 def _sides(y: PyTree[Array], bounds: tuple[PyTree, PyTree] | None) -> tuple[list, list]:
     """The bounds of each leaf, None where it has none."""
-    low, high = (None, None) if bounds is None else bounds
+    if bounds is None:
+        bounds = None, None
+    check_pair(bounds)
+    low, high = bounds
     treedef = jax.tree.structure(y)
-    low, high = (jax.tree.broadcast(side, y, is_leaf=_is_none) for side in (low, high))
-    return treedef.flatten_up_to(low), treedef.flatten_up_to(high)
+    lows, highs = (treedef.flatten_up_to(like(side, y, "bounds")) for side in (low, high))
+    for side in (*lows, *highs):
+        if side is not None:
+            check_real(side, "bounds")
+    return lows, highs
 
 
 def _all_bounded(y: PyTree[Array], bounds: tuple[PyTree, PyTree] | None) -> bool:

@@ -93,7 +93,10 @@ def _count(value: Any, name: str) -> int | None:
 def _number(value: Any, name: str) -> float | None:
     if value is None:
         return None
-    number = float(value)
+    try:
+        number = float(value)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{name} must be a number, or None for no limit: {value!r}") from error
     if math.isnan(number):
         raise ValueError(f"{name} is NaN: give a number, or None for no limit")
     return number

@@ -42,6 +42,6 @@ def as_baseline(baseline: str | AbstractBaseline) -> AbstractBaseline:
     """The baseline that a name stands for."""
     if isinstance(baseline, AbstractBaseline):
         return baseline
-    if baseline in NAMED:
+    if isinstance(baseline, str) and baseline in NAMED:
         return NAMED[baseline]()
     raise ValueError(f"baseline must be one of {sorted(NAMED)} or an object, not {baseline!r}")

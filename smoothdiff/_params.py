@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from smoothdiff._numbers import check_real, check_whole
+
 
 def is_concrete(x: Any) -> bool:
     """Whether the value can be looked at now, which it cannot while JAX traces it."""
@@ -33,8 +35,9 @@ def as_key(key: Any) -> Array:
 
 def as_argnums(argnums: int | Sequence[int], num_args: int) -> tuple[int, ...]:
     """The chosen positions among `num_args` arguments of the function, as non-negative numbers."""
-    chosen = (argnums,) if isinstance(argnums, int) else tuple(argnums)
+    chosen = tuple(argnums) if isinstance(argnums, Sequence) else (argnums,)
     for i in chosen:
+        check_whole(i, "argnums")
         if not -num_args <= i < num_args:
             raise ValueError(
                 f"argnums={argnums} but the function was given {num_args} positional argument(s) "
@@ -147,7 +150,8 @@ def take_apart(target: PyTree, sigma: PyTree, bounds: tuple[PyTree, PyTree] | No
     """Checks the parameters of a call and lays the smoothed leaves out as one vector."""
     paths, treedef = jax.tree_util.tree_flatten_with_path(target)
     names = [jax.tree_util.keystr(path) for path, _ in paths]
-    sigmas = _match(sigma, target, "sigma")
+    # as floats, as JAX has no integers of any size
+    sigmas = [float(s) if type(s) is int else s for s in _match(sigma, target, "sigma")]
     smoothed = tuple(s is not None for s in sigmas)
     if not any(smoothed):
         raise ValueError(
@@ -178,8 +182,7 @@ def take_apart(target: PyTree, sigma: PyTree, bounds: tuple[PyTree, PyTree] | No
     ]
     low = high = None
     if bounds is not None:
-        if not (isinstance(bounds, tuple | list) and len(bounds) == 2):
-            raise ValueError("bounds must be a pair (low, high) of numbers or pytrees")
+        check_pair(bounds)
         lows = side_leaves(bounds[0], -np.inf, target)
         highs = side_leaves(bounds[1], np.inf, target)
         for lo, hi, leaf, name, keep in zip(lows, highs, leaves, names, smoothed, strict=True):
@@ -193,16 +196,25 @@ def take_apart(target: PyTree, sigma: PyTree, bounds: tuple[PyTree, PyTree] | No
     return Params(layout, theta, width, sigma_traced, low, high, sound, free)
 
 
-def _match(value: PyTree, target: PyTree, what: str) -> list:
-    """One entry of `value` for each leaf of `target`; a number stands for all of them."""
+def like(value: PyTree, target: PyTree, what: str) -> PyTree:
+    """A tree with an entry of `value` for each leaf of `target`; a number stands for all of them.
+
+    Raises:
+        ValueError: it has another structure.
+    """
     try:
-        full = jax.tree.broadcast(value, target, is_leaf=lambda v: v is None)
+        return jax.tree.broadcast(value, target, is_leaf=lambda v: v is None)
     except ValueError as error:
         raise ValueError(
             f"{what} must be a number or a pytree with the structure of the parameters, "
             f"{jax.tree.structure(target)}, not {jax.tree.structure(value)}"
             + ("; a list is a pytree: use np.array" if isinstance(value, list) else "")
         ) from error
+
+
+def _match(value: PyTree, target: PyTree, what: str) -> list:
+    """One entry of `value` for each leaf of `target`."""
+    full = like(value, target, what)
     # a None in the parameters themselves is no leaf, so it needs no entry
     return jax.tree.structure(target).flatten_up_to(full)
 
@@ -224,6 +236,7 @@ def _as_real(leaf: Any, name: str) -> Array:
 
 
 def _check_shape(value: Any, leaf: Array, what: str, name: str) -> None:
+    check_real(value, f"{what}{name}")
     try:
         fits = np.broadcast_shapes(jnp.shape(value), leaf.shape) == leaf.shape
     except ValueError:
@@ -237,8 +250,6 @@ def _check_shape(value: Any, leaf: Array, what: str, name: str) -> None:
 
 def _check_sigma(sigma: Any, leaf: Array, name: str) -> None:
     _check_shape(sigma, leaf, "sigma", name)
-    if jnp.iscomplexobj(sigma):
-        raise TypeError(f"sigma{name} is complex: the smoothing width must be a real number")
     if not is_concrete(sigma):
         return
     width = np.asarray(sigma)
@@ -269,6 +280,12 @@ def _sigma_fits(sigma: Any, leaf: Array) -> Array:
     width = jnp.broadcast_to(jnp.asarray(sigma).astype(leaf.dtype), leaf.shape)
     theta = jax.lax.stop_gradient(leaf)
     return jnp.all((theta + width / 2 > theta) & (width < jnp.inf))
+
+
+def check_pair(bounds: Any) -> None:
+    """Raises ValueError unless bounds are two sides."""
+    if not (isinstance(bounds, tuple | list) and len(bounds) == 2):
+        raise ValueError("bounds must be a pair (low, high) of numbers or pytrees")
 
 
 def side_leaves(side: PyTree, default: float, target: PyTree) -> list:

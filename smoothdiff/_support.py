@@ -264,7 +264,7 @@ def as_support(support: Any) -> AbstractSupport | None:
     """The support itself, or a plain function as one."""
     if support is None or isinstance(support, AbstractSupport):
         return support
-    if callable(support):
+    if callable(support) and not isinstance(support, type):
         return FunctionSupport(support)
     raise TypeError(f"support must be a linear function of the parameters, not {support!r}")
 

@@ -1,6 +1,7 @@
 """What the solvers share: progress that a host loop can read, and options."""
 
 import abc
+import dataclasses
 from functools import partial
 from typing import Any
 
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from smoothdiff._numbers import check_whole
 from smoothdiff._params import Params, as_key, take_apart
 from smoothdiff._seen import Seen
 from smoothdiff._solvers._point_search import Sizes
@@ -121,7 +123,11 @@ def unless_failed(finite: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
 
 
 def check_settings(solver: Any) -> None:
-    """Raises ValueError unless those settings hold that several solvers have."""
+    """Raises TypeError or ValueError unless those settings hold that several solvers have."""
+    for field in dataclasses.fields(solver):
+        value = getattr(solver, field.name)
+        if field.type is int or (field.type == int | None and value is not None):
+            check_whole(value, field.name)
     count, nonfinite = solver.num_samples, solver.nonfinite
     if count is not None and count < 1:
         raise ValueError(f"num_samples={count}: a step needs at least one evaluation")

@@ -1,0 +1,24 @@
+"""What must be a number."""
+
+import operator
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+
+def check_whole(value: Any, name: str) -> None:
+    """Raises TypeError unless it is a whole number."""
+    try:
+        operator.index(value)
+    except TypeError as error:
+        raise TypeError(f"{name} must be a whole number, not {value!r}") from error
+
+
+def check_real(value: Any, name: str) -> None:
+    """Raises TypeError unless it is a real number or an array of them."""
+    dtype = getattr(value, "dtype", None) or np.asarray(value).dtype
+    if not (jnp.issubdtype(dtype, jnp.number) or jnp.issubdtype(dtype, jnp.bool_)):
+        raise TypeError(f"{name} must be a real number or an array of them, not {value!r}")
+    if jnp.issubdtype(dtype, jnp.complexfloating):
+        raise TypeError(f"{name} = {value} is complex: it must be a real number")
