@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import smoothdiff as sd
+from smoothdiff._dask import OnDask
 
 distributed = pytest.importorskip("distributed")
 
@@ -94,6 +95,39 @@ def test_a_worker_that_dies_or_hangs_loses_its_call_alone(at, client):
     with pytest.raises(sd.BlackBoxError, match="sample 1 of 6: raised"):
         jax.vmap(box(client, timeout=6.0))(xs)
     np.testing.assert_array_equal(jax.vmap(box(client))(xs.at[1].set(0.0)), [0.5, 0, -1, 0, 0, 0])
+
+
+class SlowToKnow:
+    """A client of a scheduler that hears of a cancellation some looks later."""
+
+    def __init__(self):
+        self.events, self.looks = [], 0
+
+    def get_executor(self, pure):
+        assert pure is False
+
+    def processing(self):
+        self.looks += 1
+        if self.looks > 3:
+            self.events.append("forgotten")
+            return {"tcp://a": ()}
+        return {"tcp://a": ("call",)}
+
+    def cancel(self):
+        self.events.append("cancelled")
+
+    def run(self, fun, workers, **_):
+        self.events.append(f"killed {workers}")
+        return dict.fromkeys(workers)
+
+
+def test_a_worker_is_killed_once_the_scheduler_knows_that_its_call_was_cancelled():
+    """Before, it would hand the call to another worker, which would then hang."""
+    client = SlowToKnow()
+    calls = OnDask(client)
+    calls._keys[client] = "call"
+    calls._stop(client)
+    assert client.events == ["cancelled", "forgotten", "killed ['tcp://a']"]
 
 
 @pytest.fixture
