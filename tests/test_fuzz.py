@@ -108,7 +108,8 @@ def test_what_a_host_function_returns_arrives_or_is_refused():
             assert np.all(np.isfinite(came.astype(np.float64)))
             wide = exact.astype(np.float64)
             spacing = float(jnp.finfo(came.dtype).eps)
-            small = float(jnp.finfo(came.dtype).smallest_subnormal)
+            # XLA's threads take subnormal numbers for zero
+            small = float(jnp.finfo(came.dtype).tiny)
             error = np.abs(came.astype(np.float64) - wide)
             assert np.all(error <= spacing * np.abs(wide) + small), (value, name, came)
     assert 0.1 * CASTS < refused < 0.9 * CASTS
