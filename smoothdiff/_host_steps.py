@@ -4,6 +4,7 @@ The parts know shapes only. So they are compiled once for all functions, keys, s
 and only for those stages that a run comes to.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -70,7 +71,9 @@ class HostProblem(Problem):
 
     def _evaluator(self, args: PyTree, y: PyTree) -> Evaluator:
         solver = self.solver
-        return evaluator(self.fun, solver.squares, args, y, getattr(solver, "batch_size", None))
+        evaluate = evaluator(self.fun, solver.squares, args, y, getattr(solver, "batch_size", None))
+        sharding = getattr(solver, "sharding", None)
+        return dataclasses.replace(evaluate, sharding=sharding)
 
 
 class HostSteps(eqx.Module):

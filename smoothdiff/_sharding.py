@@ -57,6 +57,14 @@ def check_parts(sharding: NamedSharding, samples: int, what: str) -> None:
         )
 
 
+def columns_shared_out(rows: jax.Array, sharding: NamedSharding) -> jax.Array:
+    """Rows of which each device has some columns, if they can be shared equally."""
+    if rows.shape[1] % parts(sharding):
+        return rows
+    columns = NamedSharding(sharding.mesh, PartitionSpec(None, *sharding.spec))
+    return jax.lax.with_sharding_constraint(rows, columns)
+
+
 def shared_out(rows: PyTree, sharding: NamedSharding | None) -> PyTree:
     """Rows, each where its sample is; without a sharding as they are."""
     if sharding is None:

@@ -7,6 +7,7 @@ import inspect
 import math
 import os
 import re
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +29,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::RuntimeWarni
 REFUSAL = TypeError, ValueError, sd.BlackBoxError, sd.MinimiseError
 
 
-def outcome(call):
+def outcome(call) -> tuple[Any, Any]:
     """What it returns, or what it raises."""
     try:
         return call(), None
@@ -81,7 +82,8 @@ def returned(random):
 
 
 def test_what_a_host_function_returns_arrives_or_is_refused():
-    random, given = np.random.default_rng(0), [None]
+    random = np.random.default_rng(0)
+    given: list[Any] = [None]
     boxes = {}
     for shape in ((), (3,)):
         for name in PROMISED:
@@ -230,7 +232,7 @@ def says_what_to_write(message):
 
 def stairs(x, a, t, unit):
     """Steps at t of heights a, along each parameter, which is in this unit."""
-    return jnp.sum(jnp.where(x / unit > t, a, 0.0)) + jnp.sum(jnp.abs(x / unit - t))
+    return jnp.asarray(jnp.where(x / unit > t, a, 0.0)) + jnp.sum(jnp.abs(x / unit - t))
 
 
 def made_transform(random):
@@ -330,8 +332,8 @@ def test_runs_return_the_lowest_point_of_those_that_they_paid_for():
         box = sd.black_box(host, out, on_nonfinite="nan")
         bounds = (y0 - 1, y0 + 2) if random.integers(2) else None
         sigma = None if random.integers(2) else float(10 ** random.uniform(-2, 1))
-        call = sd.least_squares if squares else sd.minimise
-        kind = sd.GaussNewton if squares else sd.NewtonCG
+        call: Any = sd.least_squares if squares else sd.minimise
+        kind: Any = sd.GaussNewton if squares else sd.NewtonCG
         solver = None if sigma is None else kind(sigma, nonfinite="drop")
         where = i, shape, squares, y0, sigma, bounds, most
         loss = lambda y, args, box=box: box(y)

@@ -50,6 +50,19 @@ text = jax.jit(f).lower(key, x).compile().as_text()
 shapes = {int(rows) for rows in re.findall(r"\\[(\\d+),53\\]", text)}
 assert shapes == {64 // count}, shapes  # of all samples no device has more
 assert len(re.findall(r" all-reduce(?:-start)?\\(", text)) == 1, text
+
+# a solver: devices evaluate its points, and each keeps a part of the residuals of all
+bend = lambda y, args: jnp.tile(y + jnp.sin(y) / 2 - jnp.arange(3.0), 16)[:40]
+run = {"key": key, "max_evaluations": 8 * count}
+with_devices = lambda s: sd.GaussNewton(0.1, num_samples=count, sharding=s)
+one, many = (
+    sd.least_squares(bend, x, solver=with_devices(s), **run) for s in (None, mesh)
+)
+assert one.evaluations == many.evaluations
+np.testing.assert_allclose(many.fun, one.fun, atol=1e-6)
+np.testing.assert_allclose(many.y, one.y, atol=1e-4)
+rows = many.state.search.history.rows
+assert {shard.data.shape for shard in rows.addressable_shards} == {(len(rows), 40 // count)}
 """
 
 
@@ -89,6 +102,14 @@ def test_what_cannot_be_shared_out_is_an_error(key):
     with pytest.raises(TypeError, match=r"must be a mesh of devices, such as jax\.make_mesh"):
         as_users_have_it(sd.smooth_grad)(jnp.sum, 0.1, num_samples=12, sharding=jax.devices())
     grad(NamedSharding(square, PartitionSpec("b")))(key, jnp.ones(2))
+
+
+def test_a_solver_with_devices_evaluates_all_at_once():
+    mesh = Mesh(np.array(jax.devices()[:1]), ("samples",))
+    with pytest.raises(ValueError, match="leave out batch_size"):
+        sd.GaussNewton(0.1, sharding=mesh, batch_size=4)
+    with pytest.raises(TypeError, match="must be a mesh of devices"):
+        as_users_have_it(sd.GaussNewton)(0.1, sharding=jax.devices())
 
 
 def test_devices_have_the_same_number_of_samples(monkeypatch):

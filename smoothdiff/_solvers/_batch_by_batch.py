@@ -139,7 +139,7 @@ def step(
     progress, search = state.progress, state.search
     params = smoothed_params(solver, y, progress.step, options)
     numbers = in_step(args, options, progress.step)
-    residuals = Evaluator(fn, numbers, params.layout, True, solver.batch_size)
+    residuals = Evaluator(fn, numbers, params.layout, True, solver.batch_size, solver.sharding)
     key = jax.random.fold_in(read_options(options)[0], progress.step)
     count, _, tried = sizes_of(solver, y)
     sigma = params.sigma * search.scale
@@ -206,11 +206,13 @@ def judge(
         params = smoothed_params(solver, y, progress.step, options)
         points = _points(solver, params, key, params.sigma * scale, count)
         numbers = in_step(args, options, progress.step)
-        residuals = Evaluator(fn, numbers, params.layout, True, solver.batch_size)
+        residuals = Evaluator(fn, numbers, params.layout, True, solver.batch_size, solver.sharding)
         return fresh_loss(residuals, points, solver.nonfinite)
 
     params = smoothed_params(solver, y, progress.step, options)
-    values = by_rows(Evaluator(fn, args, params.layout, True, solver.batch_size), options)
+    values = by_rows(
+        Evaluator(fn, args, params.layout, True, solver.batch_size, solver.sharding), options
+    )
     # every iterate but the last was evaluated
     old = progress.start_y, progress.best_y
     return judged(progress, values, estimate, count, [y], old)

@@ -6,15 +6,18 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.sharding import NamedSharding
 from jaxtyping import Array, Float, PyTree
 
 from smoothdiff._params import Layout
+from smoothdiff._sharding import columns_shared_out, shared_out
 
 
 class Evaluator(eqx.Module):
     """The function with its arguments.
 
-    It returns residuals, whose `squares` are minimised, or one number.
+    It returns residuals, whose `squares` are minimised, or one number. With a `sharding` devices
+    share out the points, and then keep a part of each row.
     """
 
     fn: Callable[[PyTree, Any], tuple[PyTree, PyTree]]
@@ -22,6 +25,7 @@ class Evaluator(eqx.Module):
     layout: Layout = eqx.field(static=True)
     squares: bool = eqx.field(static=True)
     batch_size: int | None = eqx.field(static=True)
+    sharding: NamedSharding | None = eqx.field(static=True, default=None)
 
     def __call__(self, points: Float[Array, "m n"]) -> tuple[Float[Array, "m P"], PyTree]:
         """The rows, and the aux of the first."""
@@ -36,6 +40,9 @@ class Evaluator(eqx.Module):
             leaves = [jnp.ravel(leaf).astype(x.dtype) for leaf in jax.tree.leaves(out)]
             return jnp.concatenate(leaves), aux
 
+        if self.sharding is not None:
+            rows, aux = jax.vmap(row)(shared_out(points, self.sharding))
+            return columns_shared_out(rows, self.sharding), aux
         return jax.lax.map(row, points, batch_size=self.batch_size or len(points))
 
     def funs(self, rows: Float[Array, "m P"]) -> Float[Array, " m"]:

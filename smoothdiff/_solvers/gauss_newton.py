@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import KW_ONLY
 from typing import Any, ClassVar, Literal
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
@@ -12,6 +13,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from smoothdiff._params import layout_of
 from smoothdiff._samplers import AbstractSampler
+from smoothdiff._sharding import as_sharding
 from smoothdiff._solvers import _batch_by_batch, _point_by_point
 from smoothdiff._solvers._base import AbstractSmoothSolver, check_settings, smoothed_params, stopped
 from smoothdiff._solvers._evaluator import Evaluator
@@ -98,6 +100,9 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             residuals with several minima, or with plateaus. They begin anywhere within the bounds,
             or without bounds around the best point so far, at a random width. With batches they
             begin at the first point. The best point of all is returned.
+        sharding: devices that share out the evaluations of a step, as for `smooth`: so give
+            `num_samples`, as many as there are devices or a multiple. Each keeps a part of every
+            row of residuals, if there are equal parts.
 
     Raises:
         ValueError: no evaluation in a step, a history that holds less than a step, a
@@ -140,9 +145,15 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     norm: Callable[[PyTree], Float[Array, ""]] = optx.max_norm
     patience: int | None = None
     restarts: int = 0
+    sharding: Any = eqx.field(default=None, static=True, converter=as_sharding)
 
     def __check_init__(self):
         check_settings(self)
+        if self.sharding is not None and self.batch_size is not None:
+            raise ValueError(
+                "with a sharding all samples are evaluated at once, each device its share: leave "
+                "out batch_size, and give a smaller num_samples"
+            )
         count, kept = self.num_samples, self.history
         if count is not None and kept is not None and kept < count:
             raise ValueError(
@@ -196,7 +207,9 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         if sizes is None:
             return _batch_by_batch.step(self, fn, y, args, options, state)
         parts = _point_by_point.PointStep(self, sizes, y, options, state)
-        return parts.step(Evaluator(fn, parts.numbers(args), layout_of(y), True, self.batch_size))
+        return parts.step(
+            Evaluator(fn, parts.numbers(args), layout_of(y), True, self.batch_size, self.sharding)
+        )
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """Where the last search leads nowhere any more, or after a failed step."""
@@ -217,7 +230,7 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             y, stats = _batch_by_batch.judge(self, fn, y, args, options, state)
         else:
             parts = _point_by_point.PointStep(self, sizes, y, options, state)
-            evaluate = Evaluator(fn, args, layout_of(y), True, self.batch_size)
+            evaluate = Evaluator(fn, args, layout_of(y), True, self.batch_size, self.sharding)
             y, stats = parts.judge(by_rows(evaluate, options))
             aux = state.aux
         return y, aux, stats
