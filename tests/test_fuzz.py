@@ -232,7 +232,7 @@ def says_what_to_write(message):
 
 def stairs(x, a, t, unit):
     """Steps at t of heights a, along each parameter, which is in this unit."""
-    return jnp.asarray(jnp.where(x / unit > t, a, 0.0)) + jnp.sum(jnp.abs(x / unit - t))
+    return jnp.sum(jnp.asarray(jnp.where(x / unit > t, a, 0.0))) + jnp.sum(jnp.abs(x / unit - t))
 
 
 def made_transform(random):
