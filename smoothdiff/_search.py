@@ -204,10 +204,12 @@ class Search:
             yield end
             yield from (self._clipped(here + share * (end - here)) for share in _SHARES)
         params = self._steps.parts(self._y, self._state).params()
-        width = np.asarray(params.sigma * search.width())
+        sigma, here = np.asarray(params.sigma), np.asarray(search.iterate())
+        # so wide that there are other points, where a radius has come to nothing
+        least = np.sqrt(np.finfo(here.dtype).eps) * np.maximum(sigma, np.abs(here))
+        width = np.maximum(sigma * np.asarray(search.width()), least)
         while True:
-            away = width * self._random.standard_normal(width.shape)
-            yield self._clipped(np.asarray(search.iterate()) + away)
+            yield self._clipped(here + width * self._random.standard_normal(width.shape))
 
     def _round(self, count: int) -> list[np.ndarray]:
         """The next points of this round, and of no later one."""
