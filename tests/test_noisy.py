@@ -190,11 +190,12 @@ def test_a_run_that_is_taken_up_again_ends_with_the_same_bits(host, tmp_path):
     ],
 )
 def test_the_same_under_optimistix(minimise, twin, fun, solver, args):
-    run = minimise(fun, START, args, key=KEY, solver=solver, max_steps=40, takes_key=True)
+    """But for rounding, which noise makes larger from step to step: so the first 15."""
+    run = minimise(fun, START, args, key=KEY, solver=solver, max_steps=15, takes_key=True)
     options = {"key": KEY, "takes_key": True}
     pair = lambda y, args: fun(y, *args)
-    found = twin(pair, solver, START, (args, KEY), options=options, max_steps=40, throw=False)
-    np.testing.assert_allclose(run.y, found.value, rtol=2e-3)
+    found = twin(pair, solver, START, (args, KEY), options=options, max_steps=15, throw=False)
+    np.testing.assert_allclose(run.y, found.value, rtol=1e-4)
     assert run.evaluations == found.stats["evaluations"]
 
 
