@@ -4,13 +4,13 @@ The parts know shapes only. So they are compiled once for all functions, keys, s
 and only for those stages that a run comes to.
 """
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.sharding import NamedSharding
 from jaxtyping import Array, Bool, Float, PyTree
 
 from smoothdiff._params import layout_of
@@ -71,9 +71,8 @@ class HostProblem(Problem):
 
     def _evaluator(self, args: PyTree, y: PyTree) -> Evaluator:
         solver = self.solver
-        evaluate = evaluator(self.fun, solver.squares, args, y, getattr(solver, "batch_size", None))
-        sharding = getattr(solver, "sharding", None)
-        return dataclasses.replace(evaluate, sharding=sharding)
+        parts = (getattr(solver, name, None) for name in ("batch_size", "sharding"))
+        return evaluator(self.fun, solver.squares, args, y, *parts)
 
 
 class HostSteps(eqx.Module):
@@ -151,10 +150,15 @@ class _Function(eqx.Module):
 
 
 def evaluator(
-    fun: Callable, squares: bool, args: PyTree, y: PyTree[Array], size: int | None = None
+    fun: Callable,
+    squares: bool,
+    args: PyTree,
+    y: PyTree[Array],
+    size: int | None = None,
+    sharding: NamedSharding | None = None,
 ) -> Evaluator:
     """The function, which returns residuals or not, for parameters like `y`."""
-    return Evaluator(_Function(fun), args, layout_of(y), squares, size)
+    return Evaluator(_Function(fun), args, layout_of(y), squares, size, sharding)
 
 
 def rows_at(evaluate: Evaluator, points: Float[Array, "m n"], at_once: int) -> Float[Array, "m P"]:

@@ -155,3 +155,13 @@ def test_bounds_hold():
 def test_wrong_arguments_are_told_what_to_write(call, error, match):
     with pytest.raises(error, match=match):
         call()
+
+
+def test_there_is_always_another_point():
+    """Also where the radius has come to nothing, so that a point within it is one that is known."""
+    search = sd.Search(jnp.zeros(2), key=KEY)
+    for _ in range(25):
+        points = search.ask(2)
+        assert len({point.tobytes() for point in points}) == 2
+        search.tell(points, [(y[0] - 1) ** 2 + (y[1] + 2) ** 2 for y in points])
+    np.testing.assert_array_equal(search.y, [1, -2])

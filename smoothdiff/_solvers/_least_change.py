@@ -30,9 +30,10 @@ _RIDGE = {"float32": 1e-7, "float64": 1e-12}
 class Quadratic(NamedTuple):
     """The gradient and the Hessian at the center, in units of the metric.
 
-    The polynomial, a constant, a slope and a bend, is 1 at the farthest point, which is so far
-    away, and 0 at the other points, as far as they are interpolated. The highest of the `used`
-    points is so far above the center. They are so far `away`, the others at the center.
+    So many points are `used`, and one of them has the value that is `highest` above the center's.
+    `away` are their places, seen from the center; those of other points are zero. The farthest is
+    at the distance `farthest`. The `polynomial`, a constant, a slope and a bend, is 1 there and 0
+    at the others, as far as they are interpolated.
     """
 
     grad: Float[Array, " n"]

@@ -15,11 +15,10 @@ from jaxtyping import Array, Bool, Float
 from smoothdiff._solvers._base import dot
 from smoothdiff._solvers._least_change import Quadratic
 from smoothdiff._solvers._metric import Metric
+from smoothdiff._solvers._ratio_test import TELLING
 
 # the check is so many steps away
 _STEPS = 10.0
-# the rise that is predicted is about so many roundings of the value, or more
-_TELLING = 1000
 # a rise that is so many times higher or lower than predicted is right
 _RIGHT = 2.0
 
@@ -47,7 +46,7 @@ def check_step(
     mean = jnp.mean(jnp.abs(curvatures)) + tiny
 
     def far_enough(curvature: Array) -> Array:
-        rise = _TELLING * eps * jnp.abs(fun)
+        rise = TELLING * eps * jnp.abs(fun)
         return jnp.sqrt(2 * rise / (jnp.abs(curvature) + tiny))
 
     # the largest parameter moves by the root of its rounding, or more
@@ -65,6 +64,12 @@ def check_step(
 def is_right(
     before: Float[Array, ""], fun: Float[Array, ""], rise: Float[Array, ""]
 ) -> Bool[Array, ""]:
-    """Whether the function rises about as the model predicts, by enough to tell."""
+    """Whether the function rises about as the model predicts, by enough to tell.
+
+    Args:
+        before: the value at the center.
+        fun: the value at the check.
+        rise: by how much that is higher, as the model predicts.
+    """
     about = (fun - before > rise / _RIGHT) & (fun - before < rise * _RIGHT)
-    return about & (rise > _TELLING / 2 * jnp.finfo(fun.dtype).eps * jnp.abs(before))
+    return about & (rise > TELLING / 2 * jnp.finfo(fun.dtype).eps * jnp.abs(before))

@@ -112,7 +112,7 @@ class AbstractPointSearch(eqx.Module):
         """Whether a short step is a sign of convergence."""
 
     def right(self) -> Bool[Array, ""]:
-        """Whether a model was right about a check where it promised nothing.
+        """Whether the last point was a check, and the local model was right about it.
 
         Never for residuals: errors of parameters take evaluations around the answer.
         """

@@ -12,7 +12,7 @@ _FAR_OFF = 10.0
 # a step of this share of the radius would have been longer without it
 _INSIDE = 0.95
 # a reduction of so many roundings of the value is nothing, a rise of so many is one for sure
-_NOTHING, _TELLING = 8, 1000
+_NOTHING, TELLING = 8, 1000
 
 
 class Outcome(NamedTuple):
@@ -107,5 +107,5 @@ def asks_nothing(
     unit = jnp.finfo(fun.dtype).eps * jnp.abs(fun)
     little = ~(reduction > _NOTHING * unit)
     inside = jnp.linalg.norm(step) < _INSIDE * radius
-    done = little & (rise > _TELLING * unit) & inside
+    done = little & (rise > TELLING * unit) & inside
     return Asked(little & ~done, done | ~(reduction > unit))

@@ -142,7 +142,7 @@ class ValueSearch(AbstractPointSearch):
         return ~self.is_local() | self.trust.settled
 
     def checking(self) -> Bool[Array, ""]:
-        """Only the local model is checked."""
+        """The local model alone has checks."""
         return self.is_local() & self.trust.check
 
     def checked(self) -> "ValueSearch":
@@ -150,7 +150,7 @@ class ValueSearch(AbstractPointSearch):
         return eqx.tree_at(lambda s: s.trust.check, self, self.is_local())
 
     def right(self) -> Bool[Array, ""]:
-        """Whether that was the local model."""
+        """The local model alone has checks."""
         return self.is_local() & self.trust.right
 
     def lost(self, sizes: Sizes) -> Bool[Array, ""]:
