@@ -52,9 +52,21 @@ def test_parameters_that_act_together_end_the_scan_early():
     assert spent == 33
 
 
-def test_nothing_lower_ends_the_scan():
-    scan, _ = scanned(lambda y: jnp.sum((y - BEST) ** 2), BEST, 1)
-    assert scan.failed
+def test_parameters_at_their_best_do_not_hide_the_others():
+    base = BEST.at[2].set(-4.6)
+    scan, _ = scanned(rastrigin, base, 1)
+    assert scan.done()
+    np.testing.assert_allclose(scan.found, BEST, atol=0.3)
+
+
+@pytest.mark.parametrize("base", [[-1.2, 1.0, 3.0], [1.0, 1.0, 1.0]])
+def test_a_valley_ends_the_scan(base):
+    """Of two parameters that act together, one may change the function far more than the other."""
+
+    def rosenbrock(y):
+        return jnp.sum(100 * (y[1:] - y[:-1] ** 2) ** 2 + (1 - y[:-1]) ** 2)
+
+    assert scanned(rosenbrock, jnp.array(base), 1)[0].failed
 
 
 def test_infinite_values_are_no_trouble():
@@ -89,6 +101,22 @@ def solved(seed, bounds, max_evaluations):
 @pytest.mark.slow
 def test_open_sides_are_not_scanned():
     assert np.isfinite(solved(0, (-jnp.inf, HIGH), 300).fun)
+
+
+@pytest.mark.slow
+def test_a_long_search_scans_before_it_ends():
+    """In ten dimensions, where wide samples alone go on for long."""
+    best = jnp.linspace(-3, 3, 10)
+    fun = lambda y, args: jnp.sum((y - best) ** 2 + 10 * (1 - jnp.cos(2 * jnp.pi * (y - best))))
+    result = sd.minimise(
+        fun,
+        jnp.full(10, 4.2),
+        key=jax.random.key(0),
+        solver=sd.NewtonCG(1.0, restarts=10),
+        bounds=(LOW, HIGH),
+        max_evaluations=1200,
+    )
+    assert result.fun < 1e-3
 
 
 @pytest.mark.slow

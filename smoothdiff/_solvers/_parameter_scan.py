@@ -2,9 +2,9 @@
 
 Along each parameter, from bound to bound, the function is evaluated where a parabola through two
 neighbours would need the least curvature to be lower than all that is known (STEP: Langerman,
-Seront and Bersini, 1994). A short try comes first, of two parameters: if the function does not fall
-at both best places together by the sum of what it fell at each, parameters do not act alone, and
-the scan ends there.
+Seront and Bersini, 1994). A short try comes first, of two parameters: if the function does not
+change at two places together by the sum of what it changed at each, parameters do not act alone,
+and the scan ends there.
 """
 
 import equinox as eqx
@@ -19,7 +19,7 @@ _TRY, _FIRST, _MOST = 16, 50, 200
 _TRIED = 2
 # a place is to be lower than the lowest by this share of how far the median is above that
 _LOWER = 0.01
-# how far the fall at both places may be from the sum of the two, relative to that
+# how far the change at both places may be from the sum of the two, relative to the smaller one
 _OFF = 0.1
 
 
@@ -39,8 +39,9 @@ class Scan(eqx.Module):
     """Evaluations along a parameter through `base`: `taken` of `limit`, `funs` at `places`.
 
     `found` has the best places of the parameters before and `nearest` how far from there the next
-    evaluation was, `fallen` is by how much the function fell along them, `line` the next parameter.
-    In a `tried` scan all parameters follow; `tests` says that what a try found is evaluated next.
+    evaluation was, `line` is the next parameter. `mixed` has a place of each for the test of a try;
+    `change` is the sum of what the function changed there, one by one, and `least` the smallest of
+    these. In a `tried` scan all parameters follow; `tests` says that the test comes next.
     """
 
     base: Float[Array, " n"]
@@ -52,7 +53,9 @@ class Scan(eqx.Module):
     taken: Int[Array, ""]
     found: Float[Array, " n"]
     nearest: Float[Array, " n"]
-    fallen: Float[Array, ""]
+    mixed: Float[Array, " n"]
+    change: Float[Array, ""]
+    least: Float[Array, ""]
     tried: Bool[Array, ""]
     tests: Bool[Array, ""]
     failed: Bool[Array, ""]
@@ -63,7 +66,10 @@ class Scan(eqx.Module):
         none, no = jnp.zeros((), jnp.int32), jnp.asarray(False)
         empty = jnp.full(_MOST, jnp.inf, base.dtype)
         still, limit = jnp.zeros_like(fun), jnp.full_like(none, _TRY)
-        return Scan(base, fun, none, limit, empty, empty, none, base, steps, still, no, no, no)
+        huge = still + jnp.inf
+        return Scan(
+            base, fun, none, limit, empty, empty, none, base, steps, base, still, huge, no, no, no
+        )
 
     def again(self, base: Float[Array, " n"], fun: Float[Array, ""]) -> "Scan":
         """A scan through another point, of twice as many evaluations, or the first after a try."""
@@ -71,6 +77,18 @@ class Scan(eqx.Module):
         anew = Scan.start(base, fun, self.nearest)
         changed = limit, jnp.asarray(True), limit > _MOST
         return eqx.tree_at(lambda s: (s.limit, s.tried, s.failed), anew, changed)
+
+    def next(
+        self, params: Params, base: Float[Array, " n"], fun: Float[Array, ""]
+    ) -> tuple["Scan", Bool[Array, ""]]:
+        """The try if there was none, or a longer scan after one; and whether there is any."""
+        longer = self.again(base, fun)
+        more, new = self.done() & ~longer.failed, ~self.made()
+        first = Scan.start(base, fun, params.sigma)
+        scan = jax.tree.map(
+            lambda a, b, c: jnp.where(more, a, jnp.where(new, b, c)), longer, first, self
+        )
+        return scan, (more | new) & jnp.all(jnp.isfinite(jnp.stack(bounds_of(params))))
 
     def propose(
         self, low: Float[Array, " n"], high: Float[Array, " n"], count: int
@@ -82,7 +100,7 @@ class Scan(eqx.Module):
         places = jnp.where(slot == 0, low[at], high[at])
         places = jnp.where(slot < 2, places, self._easiest(count))
         line = jnp.broadcast_to(self.base, (count, n)).at[:, at].set(places)
-        return jnp.where(self.tests, self.found[None], line)
+        return jnp.where(self.tests, self.mixed[None], line)
 
     def _easiest(self, count: int) -> Float[Array, " K"]:
         """The middles of the intervals that need the least curvature."""
@@ -118,9 +136,12 @@ class Scan(eqx.Module):
         """Whether all parameters were scanned."""
         return self.tried & (self.line >= len(self.base))
 
+    def made(self) -> Bool[Array, ""]:
+        """Whether the try is over."""
+        return self.tried | self.failed
+
     def _tested(self, funs: Array) -> "Scan":
-        off = jnp.abs(self.fun - jnp.min(funs) - self.fallen) > _OFF * self.fallen
-        failed = off | ~(self.fallen > 0)
+        failed = ~(jnp.abs(jnp.min(funs) - self.fun - self.change) <= _OFF * self.least)
         scan = self.again(self.base, self.fun)
         return eqx.tree_at(lambda s: s.failed, scan, failed)
 
@@ -142,10 +163,17 @@ class Scan(eqx.Module):
         best = jnp.argmin(values)
         away = jnp.abs(places - places[best])
         nearest = jnp.min(jnp.where(away > 0, away, jnp.inf))
+        # the lowest place that is no neighbour: nearby, parameters may seem to act alone
+        far = jnp.abs(places - self.base[at]) >= jnp.abs(places[1] - places[0]) / _TRY
+        other = jnp.argmin(jnp.where(far, values, jnp.inf))
+        change = values[other] - self.fun
         line = self.line + 1
         empty = jnp.full_like(self.places, jnp.inf)
         over = eqx.tree_at(
-            lambda s: (s.line, s.places, s.funs, s.taken, s.found, s.nearest, s.fallen, s.tests),
+            lambda s: (
+                *(s.line, s.places, s.funs, s.taken, s.found, s.nearest),
+                *(s.mixed, s.change, s.least, s.tests),
+            ),
             self,
             (
                 line,
@@ -154,7 +182,9 @@ class Scan(eqx.Module):
                 jnp.zeros_like(self.taken),
                 self.found.at[at].set(places[best]),
                 self.nearest.at[at].set(nearest),
-                self.fallen + self.fun - values[best],
+                self.mixed.at[at].set(places[other]),
+                self.change + change,
+                jnp.minimum(self.least, jnp.abs(change)),
                 ~self.tried & (line == min(_TRIED, n)),
             ),
         )

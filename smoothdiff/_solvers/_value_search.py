@@ -19,7 +19,7 @@ from smoothdiff._solvers._base import all_finite
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import differ
 from smoothdiff._solvers._metric import Metric
-from smoothdiff._solvers._parameter_scan import Scan, bounded, bounds_of
+from smoothdiff._solvers._parameter_scan import Scan, bounds_of
 from smoothdiff._solvers._pilot import Pilot
 from smoothdiff._solvers._point_search import (
     FIRST,
@@ -35,6 +35,8 @@ from smoothdiff._solvers._quadratic_trust import Proposal, QuadraticTrust
 from smoothdiff._solvers._regression_step import Center
 from smoothdiff._solvers._turns import Turn
 
+# a first search is long after so many evaluations for each parameter, and one
+_LONG = 30
 # of so many later searches one begins at the start
 _PATIENT = 4
 # the widths of later searches, in sigma, as powers of ten at random
@@ -45,11 +47,12 @@ class ValueSearch(AbstractPointSearch):
     """Where a search stands, with the local model and the center of the wide samples.
 
     Those after the first, which `searches` counts, are the wide model's alone, in turns a patient
-    one at the start and some elsewhere. Only the second begins with a scan of the parameters, one
-    by one, if there are bounds; what that finds is searched like the first. A patient search never
-    goes back to the lowest sample: what is lowest by chance does not lead it away from where the
-    smoothed function is low. Nor does any search where the function is `noisy`: where it gave
-    another value for the same point, which the first round of samples begins with.
+    one at the start and some elsewhere. A `scan` of the parameters, one by one, if there is one, is
+    tried in a first search that is long, or else before the second; what that finds is searched
+    like the first. A patient search never goes back to the lowest sample: what is lowest by chance
+    does not lead it away from where the smoothed function is low. Nor does any search where the
+    function is `noisy`: where it gave another value for the same point, which the first round of
+    samples begins with.
     """
 
     steps: Float[Array, " n"]
@@ -85,7 +88,7 @@ class ValueSearch(AbstractPointSearch):
             pilot=Pilot.start(theta),
             average=None,
             steps=width * sigma,
-            scan=Scan.start(theta, never, sigma) if bounded(params) else None,
+            scan=None,
             searches=none,
             noisy=jnp.asarray(False),
             trust=QuadraticTrust.start(sigma, width),
@@ -105,7 +108,7 @@ class ValueSearch(AbstractPointSearch):
     ) -> "ValueSearch":
         """Another search: in turns a patient one at the start, and some elsewhere of any width.
 
-        The second scans the parameters one by one, if they have bounds.
+        It begins with a scan of the parameters, if one is due.
         """
         empty = jax.tree.map(jnp.zeros_like, self.history)
         searches = self.searches + 1
@@ -115,12 +118,8 @@ class ValueSearch(AbstractPointSearch):
         anew = ValueSearch.of(params, theta, params.sigma, width, empty)
         stage = jnp.full_like(self.stage, WIDE)
         if self.scan is not None:
-            # where parameters act alone, a longer scan is the best that can follow
-            scan, longer = Scan.start(*lowest, params.sigma), self.scan.again(*lowest)
-            more = self.scan.done() & ~longer.failed
-            anew = eqx.tree_at(lambda s: s.scan, anew, where(more, longer, scan))
-            closed = jnp.all(jnp.isfinite(jnp.stack(bounds_of(params))))
-            scans = (more | (searches == 1)) & closed
+            scan, scans = self.scan.next(params, *lowest)
+            anew = dataclasses.replace(anew, scan=scan)
             stage = jnp.where(scans, SCAN, stage).astype(stage.dtype)
         changed = stage, self.rounds + 1, searches, self.noisy
         return eqx.tree_at(lambda s: (s.stage, s.rounds, s.searches, s.noisy), anew, changed)
@@ -156,10 +155,10 @@ class ValueSearch(AbstractPointSearch):
     def lost(self, sizes: Sizes) -> Bool[Array, ""]:
         """Whether neither model leads anywhere; after one converged the wide one may yet."""
         lost = self.center.lost(sizes) & (self.trust.failed() | self._later())
-        return lost if self.scan is None else lost | self.scan.failed
+        return lost if self.scan is None else lost | (self.scan.failed & (self.stage == SCAN))
 
     def _patient(self, searches: Int[Array, ""]) -> Bool[Array, ""]:
-        """Whether the search with this number is a patient one; a scan comes before them all."""
+        """Whether the search with this number is a patient one."""
         return searches % _PATIENT == (1 if self.scan is None else 2)
 
     def _later(self) -> Bool[Array, ""]:
@@ -250,13 +249,13 @@ class ValueSearch(AbstractPointSearch):
 
         def local() -> "ValueSearch":
             trust = self.trust.revise(proposal, before, new.funs, new.valid)
-            return eqx.tree_at(lambda s: s.trust, known, trust)._turned(sizes)
+            return eqx.tree_at(lambda s: s.trust, known, trust)._turned(params, sizes)
 
         def wide() -> "ValueSearch":
             taken = self.taken + sizes.step
             noisy = self.noisy | (self._checks() & new.valid[0] & differ(new.funs[0], before))
             more = eqx.tree_at(lambda s: (s.taken, s.noisy), known, (taken, noisy))
-            full = lambda: more._stepped(params)._turned(sizes)
+            full = lambda: more._stepped(params)._turned(params, sizes)
             return jax.lax.cond(taken >= sizes.first, full, lambda: more)
 
         branches = [first, local, wide, lambda: known.piloted(params, new)]
@@ -268,6 +267,9 @@ class ValueSearch(AbstractPointSearch):
     def _scanned(self, params: Params, scan: Scan, sizes: Sizes) -> "ValueSearch":
         """With this scan; the best places of all parameters together are where a search begins."""
         known = eqx.tree_at(lambda s: s.scan, self, scan)
+        goes_on = scan.failed & (self.searches == 0)
+        stage = jnp.where(goes_on, WIDE, self.stage).astype(self.stage.dtype)
+        known = eqx.tree_at(lambda s: s.stage, known, stage)
         anew = known._anew(params, scan.found, scan.nearest, jnp.ones_like(scan.fun))
         anew = dataclasses.replace(anew, evaluated=jnp.full_like(self.evaluated, -sizes.step))
         return where(scan.done(), anew, known)
@@ -289,7 +291,7 @@ class ValueSearch(AbstractPointSearch):
         after = eqx.tree_at(lambda s: (s.center, s.taken, s.rounds), self, new)
         return after if average is None else after.with_mean(average.after(center.theta))
 
-    def _turned(self, sizes: Sizes) -> "ValueSearch":
+    def _turned(self, params: Params, sizes: Sizes) -> "ValueSearch":
         """The other model's turn, if this one's is over."""
         turn, local = self.turn, self.is_local()
         point, _, fun = self.history.best(self.start)
@@ -310,8 +312,19 @@ class ValueSearch(AbstractPointSearch):
         center = where(move, self.center.moved(point), self.center)
         done = trust.failed(), center.lost(sizes)
         ours, theirs = where(local, *done), where(local, *done[::-1])
-        after, other = turn.next(fun, len(self.start), (ours, theirs), stuck)
+        following, other = turn.next(fun, len(self.start), (ours, theirs), stuck)
         stage = jnp.where(local == other, WIDE, TRUST).astype(self.stage.dtype)
-        new = stage, trust, center, after
+        new = stage, trust, center, following
         turned = eqx.tree_at(lambda s: (s.stage, s.trust, s.center, s.turn), self, new)
-        return where(ended, turned, self)
+        after = where(ended, turned, self)
+        return after if after.scan is None else after._tried(after.scan, params, point, fun)
+
+    def _tried(self, scan: Scan, params: Params, point: Array, fun: Array) -> "ValueSearch":
+        """With the try of a scan next, if the first search is long and wide samples go on."""
+        due = (self.searches == 0) & (self.stage == WIDE) & ~self.turn.test
+        due &= self.evaluated >= _LONG * (len(self.start) + 1)
+        tried, possible = scan.next(params, point, fun)
+        due &= possible & ~scan.made()
+        stage = jnp.where(due, SCAN, self.stage).astype(self.stage.dtype)
+        scan = where(due, tried, scan)
+        return eqx.tree_at(lambda s: (s.stage, s.scan), self, (stage, scan))

@@ -1,5 +1,6 @@
 """Newton's method on a number that need not be differentiable, from function values alone."""
 
+import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import KW_ONLY
@@ -17,6 +18,7 @@ from smoothdiff._solvers._base import AbstractSmoothSolver, check_settings, smoo
 from smoothdiff._solvers._evaluator import Evaluator
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import by_rows
+from smoothdiff._solvers._parameter_scan import Scan, bounded
 from smoothdiff._solvers._point_search import Sizes
 from smoothdiff._solvers._value_search import ValueSearch
 
@@ -86,9 +88,10 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         patience: a search ends after so many evaluations in a row in which the wide model led
             nowhere, if the local one does not either; by default 20 (n + 1). With batches it counts
             steps, by default 30.
-        restarts: how many searches may follow: for functions with several minima. The first of them
-            tries each parameter alone, from bound to bound, and ends after 33 evaluations unless
-            the parameters act independently. All others are of wide samples alone: one of four
+        restarts: how many searches may follow: for functions with several minima. Within bounds a
+            first search that is long on wide samples, or else the second, tries each parameter
+            alone, from bound to bound. That ends after 33 evaluations unless the parameters act
+            independently. All other searches are of wide samples alone: one of four
             begins at the first point, the others anywhere within the bounds, without bounds around
             the best point so far, as wide as chance has it. With batches all begin at the first
             point. The best point of all is returned.
@@ -171,6 +174,9 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         history = History.empty(length, n, 1, theta.dtype)
         width = jnp.ones((), theta.dtype)
         search = ValueSearch.of(params, theta, params.sigma, width, history)
+        if self.restarts and bounded(params):
+            scan = Scan.start(theta, jnp.zeros_like(width), params.sigma)
+            search = dataclasses.replace(search, scan=scan)
         return _point_by_point.init(self, y, search, options, aux_struct)
 
     def step(self, fn, y, args, options, state, tags):
