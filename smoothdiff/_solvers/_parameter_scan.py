@@ -165,7 +165,8 @@ class Scan(eqx.Module):
         nearest = jnp.min(jnp.where(away > 0, away, jnp.inf))
         # the lowest place that is no neighbour: nearby, parameters may seem to act alone
         far = jnp.abs(places - self.base[at]) >= jnp.abs(places[1] - places[0]) / _TRY
-        other = jnp.argmin(jnp.where(far, values, jnp.inf))
+        apart: Array = jnp.where(far, values, jnp.inf)
+        other = jnp.argmin(apart)
         change = values[other] - self.fun
         line = self.line + 1
         empty = jnp.full_like(self.places, jnp.inf)

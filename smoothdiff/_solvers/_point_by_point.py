@@ -27,6 +27,7 @@ from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import Values, judged, judging
 from smoothdiff._solvers._point_search import AbstractPointSearch, Sizes, where
 from smoothdiff._solvers._random_numbers import in_step, takes_key
+from smoothdiff._solvers._ratio_test import taken_by_rounding
 
 # by default a search ends after so many evaluations for each parameter, and one, without a lower
 # point
@@ -139,7 +140,10 @@ class PointStep(eqx.Module):
             moved = solver.norm(params.layout.tree(points[0] - params.theta))
             scale = jnp.maximum(solver.norm(self.y), solver.norm(params.layout.tree(params.sigma)))
             rounding = math.sqrt(jnp.finfo(theta.dtype).eps) * scale
-            small = moved < jnp.maximum(solver.atol + solver.rtol * scale, rounding)
+            fell = progress.lowest_fun - fun > taken_by_rounding(progress.lowest_fun)
+            small = moved < jnp.maximum(
+                solver.atol + solver.rtol * scale, jnp.where(fell, 0, rounding)
+            )
             # a point that only teaches the model is as long as the radius
             small |= after.right() & ~lower
             small &= (solver.rtol > 0) | (solver.atol > 0)

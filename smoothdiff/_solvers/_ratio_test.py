@@ -65,8 +65,13 @@ def ratio_test(
     failed = tried & ~(ratio > _FAILED)
     long = failed & jnp.isfinite(ratio) & (ratio < -_FAR_OFF)
     count = jnp.where(failed & ~long, fails + 1, jnp.where(tried & ~failed, 0, fails))
-    taken = jnp.sqrt(jnp.finfo(before.dtype).eps) * jnp.abs(before)
-    return Outcome(tried, failed, tried & (ratio > _HELD), long, count, reduction > taken)
+    more = reduction > taken_by_rounding(before)
+    return Outcome(tried, failed, tried & (ratio > _HELD), long, count, more)
+
+
+def taken_by_rounding(fun: Float[Array, ""]) -> Float[Array, ""]:
+    """So much of a reduction may be rounding."""
+    return jnp.sqrt(jnp.finfo(fun.dtype).eps) * jnp.abs(fun)
 
 
 def settled(

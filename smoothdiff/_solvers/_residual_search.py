@@ -136,6 +136,7 @@ class ResidualSearch(AbstractPointSearch):
             predicted=jnp.zeros((count, size), dtype),
             reduction=jnp.zeros(count, dtype),
             slope=jnp.zeros(count, dtype),
+            ahead=jnp.zeros((), dtype),
             jacobian=self.trust.jacobian,
             poor=jnp.asarray(False),
         )

@@ -19,7 +19,7 @@ from smoothdiff._solvers._base import dot
 from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._point_search import powers_of_two
-from smoothdiff._solvers._ratio_test import ratio_test, settled
+from smoothdiff._solvers._ratio_test import ratio_test, settled, taken_by_rounding
 
 # evaluations that a fit may use for each parameter, and how far they count, in radii
 _USED, _REACH, _FARTHEST = 3, 1.5, 2.0
@@ -38,18 +38,24 @@ _SMALLEST, _LARGEST = 0.1, 0.5
 _FAILS, _ROUGH = 8, 2
 # ... and so many evaluations for each parameter that lower the loss by less than this share
 _SLOW, _LITTLE = 3, 0.01
+# a reduction is nothing below so many roundings, squared, of the largest loss
+_FLOOR = 100
 # a step shorter by the first factor should lower the error of the prediction below the second one,
 # or the function is rough
 _SHORTER, _SMOOTH = 0.6, 0.8
 
 
 class Proposal(NamedTuple):
-    """Steps to evaluate, in units of sigma, and what the model says of them."""
+    """Steps to evaluate, in units of sigma, and what the model says of them.
+
+    Without the radius a step of one sigma would reduce the loss by what is `ahead`.
+    """
 
     steps: Float[Array, "K n"]
     predicted: Float[Array, "K P"]
     reduction: Float[Array, " K"]
     slope: Float[Array, " K"]
+    ahead: Float[Array, ""]
     jacobian: Float[Array, "n P"]
     poor: Bool[Array, ""]
 
@@ -115,16 +121,21 @@ class TrustRegion(eqx.Module):
         jacobian, lacking, poor = self._fit(history, center, row, sigma)
         hessian, grad = dot(jacobian, jacobian.T), dot(jacobian, row)
         radii = self.radius * powers_of_two(count, row.dtype)
+        radii = jnp.append(radii, jnp.maximum(self.radius, 1))
         steps = jax.vmap(lambda radius: bounded_step(hessian, grad, radius, *sides))(radii)
         change, slope = dot(steps, jacobian), -dot(steps, grad)
         reduction = slope - jnp.sum(change**2, axis=1) / 2
+        # squares of residuals that were once larger are not known any better than that
+        largest = jnp.max(jnp.where(history.valid, history.funs, 0))
+        ahead = reduction[-1] - _FLOOR * jnp.finfo(row.dtype).eps ** 2 * largest
+        steps, change, slope, reduction = (a[:-1] for a in (steps, change, slope, reduction))
         # where the model asks for nothing, a point that teaches it something
         eps = jnp.finfo(row.dtype).eps
         improve = self.improve | ~(reduction[0] > eps * jnp.sum(row**2))
         other = _roomy(self.radius * lacking, *sides)
         steps = steps.at[0].set(jnp.where(improve, other, steps[0]))
         reduction = reduction.at[0].set(jnp.where(improve, 0, reduction[0]))
-        return Proposal(steps, row[None] + change, reduction, slope, jacobian, poor)
+        return Proposal(steps, row[None] + change, reduction, slope, ahead, jacobian, poor)
 
     def _fit(
         self, history: History, center: Array, row: Array, sigma: Array
@@ -176,6 +187,9 @@ class TrustRegion(eqx.Module):
         error = jnp.asarray(jnp.where(jnp.isfinite(fun), error, jnp.inf))
         same = jnp.all(rows[best] == row)
         outcome = ratio_test(before, fun, reduction, self.fails)
+        # what is far ahead of a radius that failures made small has not converged
+        more = outcome.more | (proposal.ahead > taken_by_rounding(before))
+        outcome = outcome._replace(more=more)
         tried, failed, held, long, fails, _ = outcome
         radii = self.radius * powers_of_two(len(funs), length.dtype)
         shorter = (self.fails > 0) & (length < _SHORTER * self.length)
