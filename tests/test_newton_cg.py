@@ -320,7 +320,7 @@ def test_restarts_begin_anywhere_within_the_bounds():
     settings = {"target": (0.7, 0.3), "bounds": (-50, 50), "seed": 5, "rtol": 1e-3}
     one = solve(watched, (1, 2), max_evaluations=1000, **settings)
     alone = np.array(EVALUATED)
-    run = solve(watched, (1, 2), restarts=7, max_evaluations=2000, **settings)
+    run = solve(watched, (1, 2), restarts=7, max_evaluations=3000, **settings)
     points = np.array(EVALUATED)
     assert one.reason in ("converged", "noise")
     assert run.reason in ("converged", "noise")

@@ -1,5 +1,6 @@
 """The local model of residuals: its step within a region, its fit, what it makes of an outcome."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -111,7 +112,7 @@ def test_directions_that_no_point_has_keep_the_old_jacobian(x64):
     assert proposal.poor
 
 
-def outcome(fun, trust=None, predicted=0.5):
+def outcome(fun, trust=None, predicted=0.5, ahead=0.0):
     """The region after a step of length one from 1, where half of that was predicted."""
     one = jnp.ones((1, 1))
     proposal = Proposal(
@@ -119,6 +120,7 @@ def outcome(fun, trust=None, predicted=0.5):
         predicted=predicted * one,
         reduction=(1 - predicted**2) / 2 * jnp.ones(1),
         slope=jnp.ones(1),
+        ahead=jnp.asarray(ahead),
         jacobian=one,
         poor=jnp.asarray(False),
     )
@@ -134,6 +136,15 @@ def test_the_radius_follows_the_acceptance_ratio():
     assert outcome(50.0).radius == pytest.approx(0.1)
     for anything in (jnp.nan, jnp.inf):
         assert outcome(anything).radius == pytest.approx(0.1)
+
+
+def test_a_radius_that_is_too_small_for_a_promise_is_no_convergence():
+    """What the model promises further on counts, unless it promises nothing there either."""
+    before = eqx.tree_at(
+        lambda t: (t.settled, t.radius), outcome(0.5), (jnp.asarray(True), jnp.asarray(1.0))
+    )
+    assert outcome(1.0, before, predicted=1.0, ahead=0.0).settled
+    assert not outcome(1.0, before, predicted=1.0, ahead=0.1).settled
 
 
 def test_steps_that_change_nothing_or_are_predicted_no_better_are_rough():

@@ -82,13 +82,12 @@ class Scan(eqx.Module):
         self, params: Params, base: Float[Array, " n"], fun: Float[Array, ""]
     ) -> tuple["Scan", Bool[Array, ""]]:
         """The try if there was none, or a longer scan after one; and whether there is any."""
-        longer = self.again(base, fun)
-        more, new = self.done() & ~longer.failed, ~self.made()
-        first = Scan.start(base, fun, params.sigma)
+        done, made = self.done(), self.made()
+        first, longer = Scan.start(base, fun, params.sigma), self.again(base, fun)
         scan = jax.tree.map(
-            lambda a, b, c: jnp.where(more, a, jnp.where(new, b, c)), longer, first, self
+            lambda a, b, c: jnp.where(made, jnp.where(done, a, b), c), longer, self, first
         )
-        return scan, (more | new) & jnp.all(jnp.isfinite(jnp.stack(bounds_of(params))))
+        return scan, ~scan.failed & jnp.all(jnp.isfinite(jnp.stack(bounds_of(params))))
 
     def propose(
         self, low: Float[Array, " n"], high: Float[Array, " n"], count: int

@@ -140,10 +140,10 @@ class PointStep(eqx.Module):
             moved = solver.norm(params.layout.tree(points[0] - params.theta))
             scale = jnp.maximum(solver.norm(self.y), solver.norm(params.layout.tree(params.sigma)))
             rounding = math.sqrt(jnp.finfo(theta.dtype).eps) * scale
-            fell = progress.lowest_fun - fun > taken_by_rounding(progress.lowest_fun)
-            small = moved < jnp.maximum(
-                solver.atol + solver.rtol * scale, jnp.where(fell, 0, rounding)
-            )
+            # a model of residuals is not checked: it has not converged while the loss falls
+            falls = progress.lowest_fun - fun > taken_by_rounding(progress.lowest_fun)
+            least_move = jnp.where(falls & solver.squares, 0, rounding)
+            small = moved < jnp.maximum(solver.atol + solver.rtol * scale, least_move)
             # a point that only teaches the model is as long as the radius
             small |= after.right() & ~lower
             small &= (solver.rtol > 0) | (solver.atol > 0)

@@ -300,8 +300,8 @@ class ValueSearch(AbstractPointSearch):
         # values with other keys are not to be compared, nor is how fast they fell
         compared = turn.over() & (self.average is None)
         ended = (compared | stuck | (~local & self.center.lost(sizes))) & ~self._later()
-        # a model about to converge goes on
-        ended &= ~(local & (self.small > 0))
+        # a model about to converge goes on, but not once it has: other searches may follow
+        ended &= ~(local & (self.small > 0)) | self.converged()
 
         # what one has found the other begins with, unless it found little
         revive = ~local & lower & self.trust.stuck()
