@@ -164,8 +164,7 @@ class Scan(eqx.Module):
         nearest = jnp.min(jnp.where(away > 0, away, jnp.inf))
         # the lowest place that is no neighbour: nearby, parameters may seem to act alone
         far = jnp.abs(places - self.base[at]) >= jnp.abs(places[1] - places[0]) / _TRY
-        apart: Array = jnp.where(far, values, jnp.inf)
-        other = jnp.argmin(apart)
+        other = jnp.argmin(jnp.asarray(jnp.where(far, values, jnp.inf)))
         change = values[other] - self.fun
         line = self.line + 1
         empty = jnp.full_like(self.places, jnp.inf)
