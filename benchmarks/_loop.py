@@ -19,6 +19,7 @@ from jax.flatten_util import ravel_pytree
 from tqdm import tqdm
 
 from benchmarks._kept import fingerprint, kept
+from benchmarks._machine import commit, here
 from benchmarks._task import Method, NativeAD, NotAble, Problem, Solve, Task, Y, precision_of
 
 CLOSED = 1e-8  # the smallest gap that is scored
@@ -27,7 +28,8 @@ WARM_UP_SEED = 1_000_003  # a start that is not in any ensemble
 WARM_UP_ITERATIONS = 3
 
 Point = tuple[int, float, np.ndarray]  # evaluations, seconds, the parameters as a vector
-Run = dict[str, Any]  # seed, ended, warm_up_seconds, evaluations, seconds, an array for each error
+# seed, ended, machine, commit, warm_up_seconds, evaluations, seconds, an array for each error
+Run = dict[str, Any]
 Runs = dict[Method, list[Run] | NotAble]
 
 
@@ -107,12 +109,12 @@ class Recorder:
         self.trace = [(0, 0.0, flat(y0))]
         self.last = self.trace[0]
         counter.evaluations = 0
-        self._began = time.perf_counter()
+        self._began = time.process_time()
 
     def __call__(self, y: Y, iterations: int | None = None) -> None:
         """Takes the y of an iteration; raises Stop after the last one."""
         found = flat(y)  # waits for the evaluations behind y
-        seconds = time.perf_counter() - self._began
+        seconds = time.process_time() - self._began
         evaluations = self._counter.evaluations if iterations is None else iterations
         self.last = (evaluations, seconds, found)
         if iterations is not None or evaluations >= GROWTH * self.trace[-1][0]:
@@ -123,7 +125,7 @@ class Recorder:
             raise Stop("by the budget")
         if self._gap is not None:
             solved = self._gap(y) <= CLOSED
-            self._began += time.perf_counter() - self._began - seconds  # that was not the method's
+            self._began += time.process_time() - self._began - seconds  # that was not the method's
             if solved:
                 raise Stop("at the optimum")
 
@@ -167,6 +169,8 @@ class Runner:
             "warm_up_seconds": warm_up,
             "seed": seed,
             "ended": ended,
+            "machine": here(),
+            "commit": commit(),
             "evaluations": np.array(evaluations),
             "seconds": np.array(seconds),
             **errors([unravel(y) for y in ys], seed),

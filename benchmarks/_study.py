@@ -9,10 +9,8 @@ tables know nothing but the results, so that they can be made again from the fil
 
 import json
 import os
-import platform
 from argparse import Namespace
 from collections.abc import Callable, Iterable
-from importlib import metadata
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -20,15 +18,11 @@ from typing import Any
 from rich.console import Console
 
 from benchmarks._grid import Grid, to_rich
+from benchmarks._machine import machine
 
 HERE = Path(__file__).parent
 COMMITTED = HERE / "results"  # what the tables of the README were made from
 RUNS = HERE / "runs"  # what a user runs; git ignores it
-PACKAGES = (
-    *("smoothdiff", "jax", "jaxlib", "optax", "optimistix", "equinox", "lineax", "numpy", "scipy"),
-    *("mitsuba", "coco-experiment", "cma", "evosax", "jaxopt", "Py-BOBYQA", "DFO-LS", "pygad"),
-    "sif2jax",
-)
 
 
 def about(options: Namespace) -> dict[str, Any]:
@@ -91,23 +85,3 @@ def rounded(tree: Any, digits: int = 4) -> Any:
     if isinstance(tree, dict):
         return {str(key): rounded(value, digits) for key, value in tree.items()}
     return [rounded(each, digits) for each in tree] if isinstance(tree, list | tuple) else tree
-
-
-def machine() -> dict[str, Any]:
-    """Where the numbers come from."""
-    versions = {of.name: of.version for of in metadata.distributions() if of.name in PACKAGES}
-    return {
-        "platform": platform.platform(),
-        "cpu": _cpu(),
-        "cores": os.cpu_count(),
-        "python": platform.python_version(),
-        "versions": versions,
-    }
-
-
-def _cpu() -> str:
-    try:
-        with open("/proc/cpuinfo") as lines:
-            return next(line.split(":")[1].strip() for line in lines if "model name" in line)
-    except (OSError, StopIteration):
-        return platform.processor()
