@@ -13,7 +13,7 @@ PACKAGES = (
     *("mitsuba", "coco-experiment", "cma", "evosax", "jaxopt", "Py-BOBYQA", "DFO-LS", "pygad"),
     "sif2jax",
 )
-SHOWN = ("smoothdiff", "jax", "mitsuba")  # versions in one line
+SHOWN = ("jax", "mitsuba")  # versions in one line: those that seconds depend on
 
 
 def machine() -> dict[str, Any]:
@@ -45,7 +45,7 @@ def here() -> str:
 
 @cache
 def commit() -> str:
-    """The last commit that changed smoothdiff, with a plus where it differs from that; or nothing."""
+    """The last commit that changed smoothdiff, with a plus where that was changed since."""
     try:
         changed = _git("status", "--porcelain", "smoothdiff")
         return _git("log", "-1", "--format=%h", "--", "smoothdiff") + "+" * bool(changed)
