@@ -10,7 +10,7 @@ import jax
 from rich.console import Console
 from tqdm import tqdm
 
-from benchmarks import _black_boxes, _descents, _listing, _registry, _study
+from benchmarks import _black_boxes, _descents, _keep, _listing, _registry, _study
 from benchmarks._task import NotAble
 from benchmarks.studies import report
 
@@ -37,6 +37,8 @@ def parser() -> argparse.ArgumentParser:
     _add(run, "full", "seeds", "methods", "tuned", "fresh", "compare")
     again = commands.add_parser("draw", help="pictures and tables of committed results")
     again.add_argument("names", nargs="+", metavar="NAME", help="of a task or of a command")
+    stay = commands.add_parser("keep", help="what was run takes its place in what is committed")
+    stay.add_argument("names", nargs="+", metavar="TASK", choices=[*_registry.tasks()])
     for name, study in _registry.studies().items():
         command = commands.add_parser(name, help=study.HELP)
         if "names" in study.OPTIONS:
@@ -69,6 +71,10 @@ def main(arguments: list[str] | None = None, runs: Path = _study.RUNS) -> None:
     elif options.command == "draw":
         for name in options.names:
             _draw(name, runs / name)
+    elif options.command == "keep":
+        for name in options.names:
+            _keep.keep(name, runs, _study.COMMITTED)
+            Console().print(f"{name}: kept in {_study.COMMITTED / name}", soft_wrap=True)
     else:
         study = _registry.studies()[options.command]
         run = getattr(study, "run", partial(_study.run, study))

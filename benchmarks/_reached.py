@@ -1,6 +1,7 @@
 """Who got there: the table in which a run ends, and the lines for those that did not."""
 
 import math
+from collections.abc import Collection
 from typing import Any, NamedTuple
 
 from benchmarks._grid import Grid, Row, short, spread
@@ -55,10 +56,12 @@ def entered(task: dict[str, Any]) -> tuple[list[str], list[str]]:
     return [n for n in names if there[n]], [n for n in names if not there[n]]
 
 
-def reached(task: dict[str, Any], brief: bool = False) -> Grid:
+def reached(
+    task: dict[str, Any], brief: bool = False, alike: Collection[str] | None = None
+) -> Grid:
     """Of those that got there, what they took to each level, and what they left.
 
-    In brief it fits into 80 columns.
+    In brief it fits into 80 columns. `alike` are the methods whose seconds can be compared.
     """
     methods, budget = able(task), task["budget"]
     rows = []
@@ -71,17 +74,19 @@ def reached(task: dict[str, Any], brief: bool = False) -> Grid:
             median = short(took_so_many["median"])
             shown[f"{level} %"] = spread(took_so_many) if level == SOLVED else median
         seconds = levels[SOLVED]["seconds"]
-        shown["seconds"] = short(seconds["median"]) if brief else spread(seconds)
+        said = short(seconds["median"]) if brief else spread(seconds)
+        shown["seconds"] = said if alike is None or name in alike else f"({said})"
         if not brief:
             shown["parameters"] = short(parameters["evaluations"]["median"])
         shown["left, %"] = short(_percent(found["final"][ERROR]["median"]))
         rows.append((name, shown))
     limit = f"At most {budget['evaluations']:,} evaluations or {budget['seconds']:g} s a run."
     parameters = "" if brief else " Parameters: evaluations to 99 % of their error."
+    elsewhere = "" if alike is None or {*alike} >= {*methods} else " (in brackets: elsewhere)"
     return Grid(
         title=f"{task['title']}: evaluations to 90, 99 and 99.9 % of the image error",
         caption=f"Medians [quartiles] over the starts; - is no more than half of them. Seconds are "
-        f"to 99 %.{parameters} {limit}",
+        f"to 99 %{elsewhere}.{parameters} {limit}",
         columns=("method", *(rows[0][1] if rows else ())),
         rows=tuple(
             Row(name_of(name, methods[name]["title"]), tuple(shown.values()), name, is_ours(name))
@@ -113,6 +118,24 @@ def not_able(task: dict[str, Any]) -> str:
         if "not_able" in found
     }
     return " ".join(f"{who} is not able here: {why}." for who, why in reasons.items())
+
+
+def ran_on(task: dict[str, Any]) -> dict[str, list[str]]:
+    """The machines, as far as they are recorded, with the methods that ran on each."""
+    found: dict[str, list[str]] = {}
+    for name, each in able(task).items():
+        for machine in each.get("machines", ()):
+            found.setdefault(machine, []).append(name)
+    return found
+
+
+def machines(task: dict[str, Any]) -> str:
+    """One line for what ran where; empty where all ran on one machine."""
+    found = ran_on(task)
+    if len(found) < 2:
+        return ""
+    each = (f"{', '.join(map(name_of, names))} on {where}" for where, names in found.items())
+    return f"Seconds can be compared on one machine only. Run: {'; '.join(each)}."
 
 
 def _percent(share: float | None) -> float | None:

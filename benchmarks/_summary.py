@@ -22,6 +22,7 @@ GAPS = {"1e0": 1.0, "1e-3": 1e-3, "1e-8": CLOSED}
 LEVELS = {"image_error": REDUCTIONS, "parameter_error": REDUCTIONS, "gap": GAPS}
 COSTS = ("evaluations", "seconds")
 POINTS = 40  # of a curve
+UNKNOWN = "a machine that was not recorded"
 DIGITS = 3  # of a number in a curve: a line in a picture needs no more
 
 
@@ -46,6 +47,8 @@ def of_runs(runs: list[Run]) -> dict[str, Any]:
     errors = [error for error in LEVELS if error in runs[0]]
     return {
         "starts": len(runs),
+        "machines": sorted({run.get("machine", UNKNOWN) for run in runs}),
+        "commits": sorted({run.get("commit", "") for run in runs} - {""}),
         "warm_up_seconds": runs[0]["warm_up_seconds"],
         "distance": quartiles([run["distance"] for run in runs]),
         "first": float(runs[0]["image_error"][-1]),  # what the first start, which is pictured, left

@@ -7,7 +7,7 @@ from typing import Any
 from benchmarks._grid import Grid, Row, short, spread
 from benchmarks._names import name_of
 from benchmarks._pictures import GAP, errors_of, names_of
-from benchmarks._reached import not_able, others, reached
+from benchmarks._reached import machines, not_able, others, reached
 from benchmarks._summary import COSTS, able
 
 CAPTIONS = {
@@ -40,7 +40,7 @@ def ending(results: dict[str, Any]) -> tuple[list[Grid], list[str]]:
         lines.append(others(task))
     if _compared_by_gap(results):
         grids.append(_family(results))
-    lines += [not_able(task) for task in results["tasks"].values()]
+    lines += [say(task) for task in results["tasks"].values() for say in (not_able, machines)]
     return grids, list(dict.fromkeys(filter(None, lines)))
 
 

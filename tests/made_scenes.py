@@ -11,11 +11,12 @@ MACHINE = {"cpu": "a <CPU>", "cores": 2, "python": "3.11", "versions": {"jax": "
 ABOUT = {"setting": "quick", "command": "python -m benchmarks run all", "machine": MACHINE}
 
 
-def run_of(seed, factor, evaluations):
+def run_of(seed, factor, evaluations, machine="a <CPU>"):
     """A run whose errors fall by `factor` a step of so many evaluations, which take 0.1 s each."""
     errors = factor ** -np.arange(6.0)
     return {
         "seed": seed,
+        "machine": machine,
         "evaluations": evaluations * np.arange(6),
         "seconds": 0.1 * evaluations * np.arange(6),
         "image_error": errors,

@@ -12,7 +12,7 @@ from stripes import REFERENCE, SIDE, TITLE, build, registered
 from benchmarks import __main__ as cli
 from benchmarks import _atlas, _pictures, _registry, _study, _tables
 from benchmarks._names import NAMES, OURS
-from benchmarks._reached import Took, took
+from benchmarks._reached import Took, machines, reached, took
 from benchmarks._summary import without_one
 from benchmarks._task import Method
 from benchmarks.studies.report import _chart, _compare, _finder, _overall, _scene
@@ -110,9 +110,44 @@ def test_all_scenes_in_one_line():
     assert "evaluations 3 wins, 0 ties, 0 losses" in said
     assert said.endswith("0 that nobody solves.")
     assert "no known share" in _compare.in_one_line([scenes[2]])
+    one = _compare.in_one_line([scene(gauss_newton=1, fr22=2)])
+    assert "The best peer takes 2 times the evaluations and 2 times the seconds of ours" in one
+    assert "on one scene, to 99 %" in one
+    assert "evaluations 1 win, 0 ties, 0 losses" in one
     (row,) = (row for row in _overall.by_method(scenes).rows if row.method == "fr22")
     assert row.cells[0] == "4 [2, 8] (2/3)"
     assert row.cells[1] == "3/0/0"
+
+
+def test_seconds_are_compared_on_one_machine_only():
+    made = scene("mug", gauss_newton=2, newton_cg=4, cma_es=3, fr22=1)
+    for name in ("cma_es", "fr22"):
+        made.ran[name]["machines"] = ["another"]
+    made.ran["cma_es"]["machines"] = ["a <CPU>"]
+    assert made.comparable("evaluations") == [*made.ran]
+    assert made.comparable("seconds") == ["gauss_newton", "newton_cg", "cma_es"]
+    assert (made.best_peer("evaluations"), made.best_peer("seconds")) == ("fr22", "cma_es")
+    assert [line for line in loses(made) if "seconds" in line] == []
+    assert "Fischer-FR22" not in first(made, "seconds")
+    rows = {row.method: row.cells for row in _overall.by_method([made]).rows}
+    assert rows["fr22"] == ("0.5 (1/1)", "0/0/1", "", "0/0/0")
+    assert rows["cma_es"][2:] == ("1.5 (1/1)", "1/0/0")
+    chart = _chart.of_scene(made, ["fr22", "gauss_newton"], "image_error", "seconds")
+    assert chart is not None
+    assert "Fischer-FR22" not in [line.name for line in chart.lines]
+    cells = {row.method: row.cells for row in reached(made.results, alike=["cma_es"]).rows}
+    assert (cells["fr22"][4], cells["cma_es"][4]) == ("(0.2)", "0.6")
+    assert machines(made.results).endswith("FR22 on another.")
+    assert machines(scene(gauss_newton=2).results) == ""
+    both = _compare.in_one_line([made, scene("bunny", gauss_newton=1, fr22=8)])
+    assert "takes 2 times [0.5, 8] the evaluations" in both
+    made.ran["cma_es"]["machines"] = ["another"]
+    both = _compare.in_one_line([made, scene("bunny", gauss_newton=1, fr22=8)])
+    assert "(seconds: on 1, with the peers of one machine)" in both
+    (answer,) = (a for a in _finder.answers([made]) if a.key == "fr22-few-plateaus-residuals")
+    assert answer.comparable("seconds") == []
+    assert answer.tally("seconds").mean is None
+    assert not answer.close("seconds")
 
 
 def test_where_ours_loses_is_never_left_out():
@@ -320,6 +355,6 @@ def test_the_page_needs_no_other_file_and_says_what_the_terminal_says(
     # the answers are there without the script, and so is the line over all scenes
     assert {f"now-{peer.key}" for peer in _finder.PEERS} <= {*page.ids}
     assert "4.5× fewer" in told
-    for text in ("The best peer of each scene takes 2.5 times", "Wang-HVPA"):
+    for text in ("The best peer takes 2.5 times", "Wang-HVPA"):
         assert text in told
         assert text in printed

@@ -73,8 +73,8 @@ def of_scene(scene: Scene, named: Sequence[str], error: str, cost: str) -> Chart
     None where all gave up at once.
     """
     curves = {}
-    for name, found in scene.ran.items():
-        curve = found["curves"][error][cost]
+    for name in scene.comparable(cost):
+        curve = scene.ran[name]["curves"][error][cost]
         if curve["ends"] is not None:
             three = np.nan_to_num(np.array(curve["quartiles"], float), nan=np.inf)
             curves[name] = grid(curve["ends"]), np.maximum(three, FLOORS[error])

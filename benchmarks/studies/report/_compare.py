@@ -85,18 +85,38 @@ def in_one_line(scenes: Sequence[Scene]) -> str:
     """All scenes, in one line."""
     found = {cost: against_best(scenes, cost) for cost in COSTS}
     means = [
-        f"{of.value:.2g} times [{of.low:.2g}, {of.high:.2g}] the {cost}"
+        f"{of.value:.2g} times{_interval(of)} the {cost}"
         for cost, each in found.items()
         if (of := each.mean) is not None
     ]
-    both = max((each.mean.scenes for each in found.values() if each.mean), default=0)
     counts = "; ".join(
-        f"{cost} {of['win']} wins, {of['tie']} ties, {of['loss']} losses"
+        f"{cost} {_counted(of['win'], 'win')}, {_counted(of['tie'], 'tie')}, "
+        f"{_counted(of['loss'], 'loss')}"
         for cost, of in ((cost, each.verdicts) for cost, each in found.items())
     )
     unsolved = found["evaluations"].verdicts["neither"]
+    who = "The best peer of each scene" if len(scenes) > 1 else "The best peer"
     return (
-        f"The best peer of each scene takes {' and '.join(means) or 'no known share'} of ours: "
-        f"geometric means over the {both} of {len(scenes)} scenes and programs that both solve, to "
-        f"{SOLVED} % of the image error; {counts}; {unsolved} that nobody solves."
+        f"{who} takes {' and '.join(means) or 'no known share'} of ours: {_over(scenes, found)}, "
+        f"to {SOLVED} % of the image error; {counts}; {unsolved} that nobody solves."
     )
+
+
+def _over(scenes: Sequence[Scene], found: dict[str, Tally]) -> str:
+    """What the means are over."""
+    if len(scenes) == 1:
+        return "on one scene"
+    most, fewer = (0 if each.mean is None else each.mean.scenes for each in found.values())
+    timed = f" (seconds: on {fewer}, with the peers of one machine)" if fewer < most else ""
+    shown = f"{most} of {len(scenes)} scenes and programs that both solve"
+    return f"geometric means over the {shown}{timed}"
+
+
+def _interval(of: Mean) -> str:
+    return f" [{of.low:.2g}, {of.high:.2g}]" if of.scenes > 1 else ""
+
+
+def _counted(number: int, word: str) -> str:
+    """One win, two wins; one loss, two losses."""
+    more = "es" if word.endswith("s") else "s"
+    return f"{number} {word}{'' if number == 1 else more}"

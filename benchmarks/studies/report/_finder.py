@@ -79,11 +79,15 @@ class Answer(NamedTuple):
 
     def tally(self, cost: str) -> Tally:
         """What came out over the scenes."""
-        return tally([pair.took(cost) for pair in self.pairs])
+        return tally([pair.took(cost) for pair in self.comparable(cost)])
+
+    def comparable(self, cost: str) -> list[Pair]:
+        """The scenes on which the cost of both can be compared."""
+        return [p for p in self.pairs if p.theirs in p.scene.comparable(cost, p.ours)]
 
     def close(self, cost: str) -> bool:
         """Whether the quartiles overlap on the only scene that both solve."""
-        pairs = [pair.took(cost) for pair in self.pairs]
+        pairs = [pair.took(cost) for pair in self.comparable(cost)]
         return [verdict(*pair) for pair in pairs if ratio(*pair) is not None] == ["tie"]
 
     @property

@@ -51,7 +51,8 @@ def by_method(scenes: Sequence[Scene]) -> Grid:
     return Grid(
         title="Each peer against ours, to 99 % of the image error",
         caption="Geometric means of the ratios of medians, [95 % over scenes] (on how many of the "
-        "scenes that it ran on both get there). Where quartiles overlap it is a tie.",
+        "scenes that it ran on both get there). Where quartiles overlap it is a tie. Seconds are "
+        "compared where both are of the same machine.",
         columns=("method", *(f"{cost}: {column}" for cost in COSTS for column in columns)),
         rows=tuple(rows),
     )
@@ -60,10 +61,11 @@ def by_method(scenes: Sequence[Scene]) -> Grid:
 def _cells(ran: Sequence[Scene], name: str) -> list[str]:
     cells = []
     for cost in COSTS:
-        pairs = ((took(s.ran[s.ours or ""], cost), took(s.ran[name], cost)) for s in ran)
-        found = tally(list(pairs))
+        alike = [scene for scene in ran if name in scene.comparable(cost)]
+        pairs = [(took(s.ran[s.ours or ""], cost), took(s.ran[name], cost)) for s in alike]
+        found = tally(pairs)
         cells += [
-            _mean(found, len(ran)),
+            _mean(found, len(alike)),
             "/".join(str(found.verdicts[v]) for v in ("win", "tie", "loss")),
         ]
     return cells
@@ -72,7 +74,7 @@ def _cells(ran: Sequence[Scene], name: str) -> list[str]:
 def _mean(found: Tally, ran: int) -> str:
     of = found.mean
     if of is None:
-        return f"- (0/{ran})"
+        return f"- (0/{ran})" if ran else ""
     interval = f" [{of.low:.2g}, {of.high:.2g}]" if of.scenes > 1 else ""
     return f"{of.value:.2g}{interval} ({of.scenes}/{ran})"
 

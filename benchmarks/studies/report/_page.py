@@ -13,7 +13,7 @@ from markupsafe import Markup, escape
 from benchmarks import _atlas, _registry
 from benchmarks._grid import short
 from benchmarks._names import NAMES, name_of
-from benchmarks._reached import not_able, others, ranked, reached, took
+from benchmarks._reached import machines, not_able, others, ran_on, ranked, reached, took
 from benchmarks._summary import COSTS
 from benchmarks.studies.report import _chart, _finder
 from benchmarks.studies.report._compare import in_one_line, ratio
@@ -46,7 +46,7 @@ def page(scenes: Sequence[Scene], results: Path, whole: bool) -> str:
             rule=RULE_TEXT,
             scenes=[of_scene(scene) for scene in scenes],
             parts=[tables, *beside],
-            machines=sorted({_machine(scene) for scene in scenes}),
+            machines=sorted({machine for scene in scenes for machine in ran_on(scene.results)}),
         )
     )
 
@@ -110,6 +110,10 @@ def _bar(answer: _finder.Answer, cost: str) -> dict[str, Any]:
     """How many times as fast, as a bar from one, in percent of the track."""
     found = answer.tally(cost)
     of = found.mean
+    if not answer.comparable(cost):
+        return {"cost": cost, "width": None, "interval": "", "low": None} | {
+            "told": "not measured on one machine"
+        }
     bar: dict[str, Any] = {"cost": cost, "width": None, "interval": "", "low": None}
     if of is None:
         ours, theirs = answer.solved
@@ -164,8 +168,8 @@ def of_scene(scene: Scene) -> dict[str, Any]:
         "more_charts": curves("parameter_error"),
         "legend": [NAMES[name] for name in named],
         "more_lines": len(scene.ran) > len(named),
-        "table": reached(results),
-        "lines": [line for line in (others(results), not_able(results)) if line],
+        "table": reached(results, alike=scene.comparable("seconds")),
+        "lines": list(filter(None, (others(results), not_able(results), machines(results)))),
         "command": scene.about["command"],
     }
 
@@ -256,10 +260,3 @@ def _film(scene: Scene) -> list[dict[str, Any]]:
         ]
         lines.append({"name": name_of(name), "frames": frames})
     return lines
-
-
-def _machine(scene: Scene) -> str:
-    machine = scene.about["machine"]
-    known = [p for p in ("smoothdiff", "jax", "mitsuba") if p in machine["versions"]]
-    packages = ", ".join(f"{p} {machine['versions'][p]}" for p in known)
-    return f"{machine['cores']} cores of {machine['cpu']}, Python {machine['python']}, {packages}"

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks import _registry
+from benchmarks._machine import in_one_line
 from benchmarks._names import is_ours
 from benchmarks._reached import took
 from benchmarks._study import committed
@@ -77,9 +78,16 @@ class Scene(NamedTuple):
         """By the rule; None where none of ours was run."""
         return self.with_residuals or self.with_one_number
 
+    def comparable(self, cost: str, ours: str | None = None) -> list[str]:
+        """The methods whose cost can be put beside that of ours: seconds of the same machine."""
+        machines = {name: found["machines"] for name, found in self.ran.items()}
+        ours = ours or self.ours or next(iter(machines))
+        return [n for n in machines if cost != "seconds" or machines[n] == machines[ours]]
+
     def best_peer(self, cost: str) -> str | None:
         """The fastest of those that are not ours, even if it gets there from few starts."""
-        costs = {name: took(self.ran[name], cost) for name in self.peers}
+        alike = self.comparable(cost)
+        costs = {name: took(self.ran[name], cost) for name in self.peers if name in alike}
         return min(costs, key=lambda name: costs[name], default=None)
 
 
@@ -90,6 +98,8 @@ def load(name: str, results: Path) -> Iterator[Scene]:
         return
     tasks = found.pop("tasks")
     for member, task in tasks.items():
+        for method in able(task).values():
+            method.setdefault("machines", [in_one_line(found["machine"])])
         scene = Scene(member, task, found, _registry.task(name), name)
         if scene.ran:
             yield scene

@@ -21,7 +21,8 @@ def amount(number: float, cost: str) -> str:
 
 def first(scene: Scene, cost: str) -> str:
     """Who is first to 99 % in a cost; nobody where quartiles overlap."""
-    found = {name: took(scene.ran[name], cost) for name in ranked(scene.results)}
+    alike = scene.comparable(cost)
+    found = {n: took(scene.ran[n], cost) for n in ranked(scene.results) if n in alike}
     there = sorted((n for n in found if found[n].reached), key=lambda name: found[name].median)
     if not there:
         return f"In {cost}, no method gets to {SOLVED} % from more than half of the starts."
@@ -85,7 +86,7 @@ def _ahead(scene: Scene, ours: str, cost: str) -> list[str]:
     lines: list[tuple[str, list[str], list[float], list[str]]] = []
     for level in REDUCTIONS:
         mine = took(scene.ran[ours], cost, level)
-        others = {name: took(found, cost, level) for name, found in scene.ran.items()}
+        others = {name: took(scene.ran[name], cost, level) for name in scene.comparable(cost)}
         ahead = [name for name in others if verdict(mine, others[name]) == "loss"]
         if not ahead:
             continue
