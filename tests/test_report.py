@@ -129,6 +129,7 @@ def test_seconds_are_compared_on_one_machine_only():
     assert (made.best_peer("evaluations"), made.best_peer("seconds")) == ("fr22", "cma_es")
     assert [line for line in loses(made) if "seconds" in line] == []
     assert "Fischer-FR22" not in first(made, "seconds")
+    assert first(made, "seconds").endswith("That is of the 3 of 4 methods run on one machine.")
     rows = {row.method: row.cells for row in _overall.by_method([made]).rows}
     assert rows["fr22"] == ("0.5 (1/1)", "0/0/1", "", "0/0/0")
     assert rows["cma_es"][2:] == ("1.5 (1/1)", "1/0/0")
@@ -142,6 +143,9 @@ def test_seconds_are_compared_on_one_machine_only():
     both = _compare.in_one_line([made, scene("bunny", gauss_newton=1, fr22=8)])
     assert "takes 2 times [0.5, 8] the evaluations" in both
     made.ran["cma_es"]["machines"] = ["another"]
+    made.ran["newton_cg"]["machines"] = ["another"]
+    assert first(made, "seconds").startswith("In seconds: GaussNewton 0.4 s [0.4 s, 0.4 s]. That")
+    assert _overall.by_scene([made]).rows[0].cells[-1] == "elsewhere"
     both = _compare.in_one_line([made, scene("bunny", gauss_newton=1, fr22=8)])
     assert "(seconds: on 1, with the peers of one machine)" in both
     (answer,) = (a for a in _finder.answers([made]) if a.key == "fr22-few-plateaus-residuals")

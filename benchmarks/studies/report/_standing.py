@@ -22,8 +22,18 @@ def amount(number: float, cost: str) -> str:
 def first(scene: Scene, cost: str) -> str:
     """Who is first to 99 % in a cost; nobody where quartiles overlap."""
     alike = scene.comparable(cost)
-    found = {n: took(scene.ran[n], cost) for n in ranked(scene.results) if n in alike}
-    there = sorted((n for n in found if found[n].reached), key=lambda name: found[name].median)
+    told = _first(scene, cost, {n: took(scene.ran[n], cost) for n in alike})
+    if len(alike) == len(scene.ran):
+        return told
+    return f"{told} That is of the {len(alike)} of {len(scene.ran)} methods run on one machine."
+
+
+def _first(scene: Scene, cost: str, found: dict[str, Took]) -> str:
+    """The same among some methods."""
+    order = [name for name in ranked(scene.results) if name in found]
+    there = sorted((n for n in order if found[n].reached), key=lambda name: found[name].median)
+    if len(found) == 1 < len(scene.ran) and there:
+        return f"In {cost}: {name_of(there[0])} {_interval(found[there[0]], cost)}."
     if not there:
         return f"In {cost}, no method gets to {SOLVED} % from more than half of the starts."
     best, *behind = there
