@@ -12,6 +12,7 @@ import numpy as np
 from benchmarks._atlas import frames, stored
 from benchmarks._grid import short
 from benchmarks._names import NAMES, is_ours, name_of
+from benchmarks._reached import alike
 from benchmarks._style import CROWDED, band, figure, headed, legend, looks, panels
 from benchmarks._summary import COSTS, GAPS, LEVELS, able, grid
 
@@ -62,8 +63,13 @@ def _has_curves(task: dict[str, Any]) -> bool:
 
 
 def _curves(task: dict[str, Any], cost: str, path: Path) -> None:
-    """Median and quartiles over the starts, a panel for each error."""
+    """Median and quartiles over the starts, a panel for each error.
+
+    Seconds are drawn of those methods that ran where the last one did, which is ours.
+    """
     methods, errors = able(task), errors_of(task)
+    if cost == "seconds":
+        methods = {name: methods[name] for name in alike(task, [*methods][-1])}
     strong = list(filter(is_ours, methods)) if len(methods) > CROWDED else []
     look = looks(methods)
     with figure(path, 1, len(errors), (4.5 * len(errors), 3.8)) as (drawn, axes):

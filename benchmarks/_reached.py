@@ -129,6 +129,14 @@ def ran_on(task: dict[str, Any]) -> dict[str, list[str]]:
     return found
 
 
+def alike(task: dict[str, Any], name: str) -> list[str]:
+    """The methods whose seconds can be put beside those of one: they ran where it ran."""
+    methods = able(task)
+    return [
+        each for each in methods if methods[each].get("machines") == methods[name].get("machines")
+    ]
+
+
 def machines(task: dict[str, Any]) -> str:
     """One line for what ran where; empty where all ran on one machine."""
     found = ran_on(task)

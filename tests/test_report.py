@@ -12,7 +12,7 @@ from stripes import REFERENCE, SIDE, TITLE, build, registered
 from benchmarks import __main__ as cli
 from benchmarks import _atlas, _pictures, _registry, _study, _tables
 from benchmarks._names import NAMES, OURS
-from benchmarks._reached import Took, machines, reached, took
+from benchmarks._reached import Took, alike, machines, reached, took
 from benchmarks._summary import without_one
 from benchmarks._task import Method
 from benchmarks.studies.report import _chart, _compare, _finder, _overall, _scene
@@ -138,6 +138,7 @@ def test_seconds_are_compared_on_one_machine_only():
     assert "Fischer-FR22" not in [line.name for line in chart.lines]
     cells = {row.method: row.cells for row in reached(made.results, alike=["cma_es"]).rows}
     assert (cells["fr22"][4], cells["cma_es"][4]) == ("(0.2)", "0.6")
+    assert alike(made.results, "fr22") == ["fr22"]
     assert machines(made.results).endswith("FR22 on another.")
     assert machines(scene(gauss_newton=2).results) == ""
     both = _compare.in_one_line([made, scene("bunny", gauss_newton=1, fr22=8)])

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from benchmarks import _registry
 from benchmarks._machine import in_one_line
 from benchmarks._names import is_ours
-from benchmarks._reached import took
+from benchmarks._reached import alike, took
 from benchmarks._study import committed
 from benchmarks._summary import able
 from benchmarks._task import TaskEntry
@@ -80,9 +80,9 @@ class Scene(NamedTuple):
 
     def comparable(self, cost: str, ours: str | None = None) -> list[str]:
         """The methods whose cost can be put beside that of ours: seconds of the same machine."""
-        machines = {name: found["machines"] for name, found in self.ran.items()}
-        ours = ours or self.ours or next(iter(machines))
-        return [n for n in machines if cost != "seconds" or machines[n] == machines[ours]]
+        if cost != "seconds":
+            return [*self.ran]
+        return alike(self.results, ours or self.ours or next(iter(self.ran)))
 
     def best_peer(self, cost: str) -> str | None:
         """The fastest of those that are not ours, even if it gets there from few starts."""
