@@ -77,7 +77,7 @@ class Race:
         return {"took": self._took(self._prepared[name], seed, y0, gap)}
 
     def _took(self, solve: Solve, seed: int, y0: Any, gap: Callable[[Any], float]) -> np.ndarray:
-        recorder = Recorder(self._counter, self._problem, y0)
+        recorder = Recorder(self._counter, y0, self._problem.budget)
         unravel: Callable[[Any], Any] = ravel_pytree(self.task.problem.like)[1]
         first, took, points = gap(y0), np.full(len(LEVELS), np.inf), 0
         looked = recorder.last[2]

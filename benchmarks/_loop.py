@@ -20,12 +20,23 @@ from tqdm import tqdm
 
 from benchmarks._kept import fingerprint, kept
 from benchmarks._machine import commit, here
-from benchmarks._task import Method, NativeAD, NotAble, Problem, Solve, Task, Y, precision_of
+from benchmarks._task import (
+    Budget,
+    Method,
+    NativeAD,
+    NotAble,
+    Problem,
+    Solve,
+    Task,
+    Y,
+    precision_of,
+)
 
 CLOSED = 1e-8  # the smallest gap that is scored
 GROWTH = 1.1  # a trace keeps a point when the evaluations have grown by this factor
 WARM_UP_SEED = 1_000_003  # a start that is not in any ensemble
-WARM_UP_ITERATIONS = 3
+WARM_UP_SECONDS = 60  # it goes on that long, as solvers compile some of their parts late
+WARM_UP_ITERATIONS = 3  # where there are gradients, and methods are one loop
 
 Point = tuple[int, float, np.ndarray]  # evaluations, seconds, the parameters as a vector
 # seed, ended, machine, commit, warm_up_seconds, evaluations, seconds, an array for each error
@@ -99,12 +110,12 @@ class Recorder:
     def __init__(
         self,
         counter: Counter,
-        problem: Problem,
         y0: Y,
+        budget: Budget,
         iterations: float = np.inf,
         gap: Callable[[Y], float] | None = None,
     ):
-        self._counter, self._budget, self._iterations = counter, problem.budget, iterations
+        self._counter, self._budget, self._iterations = counter, budget, iterations
         self._gap = gap
         self.trace = [(0, 0.0, flat(y0))]
         self.last = self.trace[0]
@@ -156,7 +167,7 @@ class Runner:
             began = time.perf_counter()
             solve = method.prepare(self._problem)
             # it compiles on a start of its own, which is not charged to it
-            self._record(solve, WARM_UP_SEED, iterations=WARM_UP_ITERATIONS)
+            self._warm_up(solve)
             self._prepared[method] = solve, time.perf_counter() - began
         solve, warm_up = self._prepared[method]
         lowest = self._task.score.optimum
@@ -178,12 +189,20 @@ class Runner:
             **{f"found {n}": ys[within(evaluations, n)] for n in self._keep},
         }
 
+    def _warm_up(self, solve: Solve) -> None:
+        """Runs what a run compiles: all of one, unless that takes long."""
+        if self._problem.gradient is not None:
+            self._record(solve, WARM_UP_SEED, iterations=WARM_UP_ITERATIONS)
+        else:
+            budget = self._problem.budget._replace(seconds=WARM_UP_SECONDS)
+            self._record(solve, WARM_UP_SEED, budget=budget)
+
     def _record(self, solve: Solve, seed: int, **until: Any) -> tuple[list[Point], str]:
         """The trace of a run, and why it ended."""
         if self._task.choose is not None:
             self._task.choose(seed)
         y0 = self._task.start(seed)
-        recorder = Recorder(self._counter, self._problem, y0, **until)
+        recorder = Recorder(self._counter, y0, **({"budget": self._problem.budget} | until))
         try:
             solve(y0, jax.random.key(seed), recorder)
         except Stop as stop:

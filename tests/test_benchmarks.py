@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import jax
@@ -187,11 +188,30 @@ def test_errors_of_a_tasks_own_and_iterations_that_a_method_counts(tmp_path):
     assert run["found 3"][0] == 3
 
 
+def test_what_is_compiled_late_is_not_charged(tmp_path):
+    def prepare(problem):
+        loss = jax.jit(problem.loss)
+
+        def solve(y0, key, record):
+            for step in range(20):
+                if step == 10 and not late:
+                    late.append(time.process_time())
+                    while time.process_time() < late[0] + 0.5:
+                        pass  # it compiles
+                loss(y0).block_until_ready()
+                record(y0)
+
+        return solve
+
+    late = []
+    run, _ = runs_of(BOWL, HALVING._replace(prepare=prepare), tmp_path)
+    assert late
+    assert run["seconds"][-1] < 0.5
+
+
 def test_long_traces_are_thinned_and_keep_their_end():
     counter = _loop.Counter()
-    recorder = _loop.Recorder(
-        counter, changed(BOWL, budget=Budget(10**6, 60)).problem, bowl_start(0)
-    )
+    recorder = _loop.Recorder(counter, bowl_start(0), Budget(10**6, 60))
     for counter.evaluations in range(1, 5001):
         recorder(BOWL.score.reference)
     trace = recorder.finish()

@@ -150,7 +150,7 @@ def ran(name: str, problem: Problem, y0) -> tuple[list, list, Counter]:
     """Evaluations after each iteration, what was found in each, and the counter."""
     counter = Counter()
     solve = _registry.method(name).prepare(counter.watched(problem))
-    recorder = Recorder(counter, problem, y0)
+    recorder = Recorder(counter, y0, problem.budget)
     evaluations, found = [], []
 
     def record(y):
