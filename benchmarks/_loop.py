@@ -197,12 +197,14 @@ class Runner:
             budget = self._problem.budget._replace(seconds=WARM_UP_SECONDS)
             self._record(solve, WARM_UP_SEED, budget=budget)
 
-    def _record(self, solve: Solve, seed: int, **until: Any) -> tuple[list[Point], str]:
+    def _record(
+        self, solve: Solve, seed: int, budget: Budget | None = None, **until: Any
+    ) -> tuple[list[Point], str]:
         """The trace of a run, and why it ended."""
         if self._task.choose is not None:
             self._task.choose(seed)
         y0 = self._task.start(seed)
-        recorder = Recorder(self._counter, y0, **({"budget": self._problem.budget} | until))
+        recorder = Recorder(self._counter, y0, budget or self._problem.budget, **until)
         try:
             solve(y0, jax.random.key(seed), recorder)
         except Stop as stop:

@@ -119,6 +119,14 @@ def test_all_scenes_in_one_line():
     assert row.cells[1] == "3/0/0"
 
 
+def test_a_peer_that_is_surer_wins_though_another_is_first_by_the_median():
+    made = never(scene(gauss_newton=2, fr22=(2,) * 3 + (60,) * 2, cma_es=(3,) * 5), "gauss_newton")
+    for level in made.ran["fr22"]["took"]["image_error"].values():
+        level["evaluations"]["upper"] = None  # it gets there from three of five
+    assert made.best_peer("evaluations") == "fr22"
+    assert "0 wins, 0 ties, 1 loss" in _compare.in_one_line([made])
+
+
 def test_seconds_are_compared_on_one_machine_only():
     made = scene("mug", gauss_newton=2, newton_cg=4, cma_es=3, fr22=1)
     for name in ("cma_es", "fr22"):

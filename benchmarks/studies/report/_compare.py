@@ -5,6 +5,7 @@ both get there from more than half of the starts; where one does there is no rat
 """
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
@@ -72,13 +73,23 @@ def tally(pairs: Sequence[tuple[Took, Took]]) -> Tally:
 
 
 def against_best(scenes: Sequence[Scene], cost: str) -> Tally:
-    """Ours against whichever peer is best on each scene, after the fact."""
-    pairs = []
+    """Ours against whichever peer is best on each scene, after the fact.
+
+    It loses where any peer is ahead beyond the quartiles, whether that one is first by the median
+    or another, which gets there from fewer starts.
+    """
+    pairs, verdicts = [], Counter[Verdict]()
     for scene in scenes:
         best = scene.best_peer(cost)
-        if scene.ours is not None and best is not None:
-            pairs.append((took(scene.ran[scene.ours], cost), took(scene.ran[best], cost)))
-    return tally(pairs)
+        if scene.ours is None or best is None:
+            continue
+        ours = took(scene.ran[scene.ours], cost)
+        each = {n: took(scene.ran[n], cost) for n in scene.comparable(cost) if n in scene.peers}
+        lost = any(verdict(ours, theirs) == "loss" for theirs in each.values())
+        verdicts["loss" if lost else verdict(ours, each[best])] += 1
+        pairs.append((ours, each[best]))
+    found = tally(pairs)
+    return found._replace(verdicts={of: verdicts[of] for of in found.verdicts})
 
 
 def in_one_line(scenes: Sequence[Scene]) -> str:
