@@ -1,5 +1,7 @@
-"""Runs for processes that are killed, each with a checkpoint. No tests here."""
+"""Runs for processes that are killed, each kept as it goes. No tests here."""
 
+import functools
+import shutil
 import time
 from pathlib import Path
 from typing import Any
@@ -9,8 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import optimistix as optx
+import pytest
+import stripes as tiny
 
 import smoothdiff as sd
+from benchmarks import __main__ as cli
+from benchmarks import _black_boxes
 
 HIDDEN = np.linspace(0.2, 0.8, 144).reshape(12, 12)
 
@@ -42,12 +48,18 @@ RUNS: dict[str, tuple[Any, np.ndarray, Any, int]] = {
 }
 
 
+@functools.cache  # what is the same function is compiled once
+def called(host: Any, squares: bool, shape: tuple[int, ...]) -> Any:
+    """What a solver is given: residuals, or the sum of their squares."""
+    box = sd.black_box(host, jax.ShapeDtypeStruct(shape, jnp.float32))
+    return lambda y, args: box(y) if squares else jnp.sum(box(y) ** 2)
+
+
 def run(name: str, folder: Path) -> None:
     """Makes the run, or goes on with it, and writes down what it found."""
     solver, y0, host, most = RUNS[name]
-    box = sd.black_box(host, jax.ShapeDtypeStruct(np.shape(host(y0)), jnp.float32))
     squares = isinstance(solver, optx.AbstractLeastSquaresSolver)
-    fun = lambda y, args: box(y) if squares else jnp.sum(box(y) ** 2)
+    fun = called(host, squares, np.shape(host(y0)))
     bounds = (-1.0, 2.0) if solver.__class__ is not sd.ZeroGrads else None
     limits = {"max_evaluations": most, "bounds": bounds, "key": jax.random.key(0)}
     (folder / "begun").touch()
@@ -56,5 +68,61 @@ def run(name: str, folder: Path) -> None:
     found = [np.asarray(result.fun), np.asarray(result.y), np.asarray(result.evaluations)]
     found += [np.asarray(record.y) for record in result.history]
     found += [np.asarray(record.fun) for record in result.history]
-    (folder / "found.part").write_bytes(b"".join(part.tobytes() for part in found))
+    write(folder, b"".join(part.tobytes() for part in found))
+
+
+def write(folder: Path, found: bytes) -> None:
+    """All of it or nothing."""
+    (folder / "found.part").write_bytes(found)
     (folder / "found.part").rename(folder / "found")
+
+
+def slowly(problem: Any) -> Any:
+    """A method of the benchmarks that takes a while, to be killed in."""
+    solve = tiny.halving(problem)
+
+    def waiting(y0: Any, key: Any, record: Any) -> None:
+        def recorded(y: Any) -> None:
+            time.sleep(0.02)
+            record(y)
+
+        solve(y0, key, recorded)
+
+    return waiting
+
+
+def benchmarks(folder: Path) -> None:
+    """Runs two methods of the benchmarks, or goes on; writes what they found, without times.
+
+    Nothing is drawn, which is done anew in any case and takes much longer.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_black_boxes, "draw", lambda results, folder: None)
+        patch.setattr(cli, "_page", lambda names, runs: None)
+        tiny.registered(patch, methods={"halving": tiny.halving, "slowly": slowly})
+        (folder / "begun").touch()
+        cli.main(["run", "all"], folder)
+    found = b""
+    for path in sorted(folder.glob("stripes/raw/*/*.npz")):
+        with np.load(path) as kept:
+            names = sorted(set(kept) - {"seconds", "json"})
+            found += b"".join(kept[name].tobytes() for name in names)
+    write(folder, found)
+
+
+def again_and_again(name: str, folder: Path) -> None:
+    """A run for whoever stops this process at times and copies what there is; then these copies.
+
+    All has been compiled before, so that little of the time goes into anything else.
+    """
+    make = benchmarks if name == "benchmarks" else functools.partial(run, name)
+    for warm in ("first", "whole"):
+        (folder / warm).mkdir()
+        make(folder / warm)
+    running = folder / "running"
+    while not (folder / "enough").exists():
+        shutil.rmtree(running, ignore_errors=True)
+        running.mkdir()
+        make(running)
+    for left in sorted(folder.glob("left*")):
+        make(left)

@@ -1,11 +1,15 @@
 """Runs that are killed at random moments and made again end with the same bits.
 
-KILLS=50 in the environment makes so many of each solver, in place of two of one.
+A process that was killed takes seconds to begin again. So most are stopped instead: the disk then
+holds what a kill would leave. The process, which has compiled all, takes up copies of that later.
+
+KILLS=50 in the environment stops each solver and the benchmarks so often, in place of four times.
 """
 
 import multiprocessing
 import os
 import shutil
+import signal
 import time
 
 import killed_runs
@@ -13,6 +17,7 @@ import numpy as np
 import pytest
 
 KILLS = int(os.environ.get("KILLS", 0))
+REAL = 2
 NAMES = list(killed_runs.RUNS)
 
 pytestmark = pytest.mark.slow
@@ -55,7 +60,7 @@ def test_a_run_that_was_killed_ends_with_the_same_bits(name, context, tmp_path):
     folder.mkdir()
     while True:
         process = begin(context, name, folder)
-        if kills < (KILLS or 2):
+        if kills < REAL:
             process.join(random.uniform(0.1, 0.9) * seconds)
             if process.is_alive():
                 process.kill()
@@ -65,8 +70,38 @@ def test_a_run_that_was_killed_ends_with_the_same_bits(name, context, tmp_path):
             assert process.exitcode == -9, process.exitcode
             continue
         assert (folder / "found").read_bytes() == want
-        if kills >= (KILLS or 2):
+        if kills >= REAL:
             break
         shutil.rmtree(folder)
         folder.mkdir()
     assert taken_up  # else this tells nothing
+
+
+@pytest.mark.parametrize("name", [*NAMES, "benchmarks"] if KILLS else [NAMES[1], "benchmarks"])
+def test_what_a_kill_would_leave_at_any_moment_is_taken_up_to_the_same_bits(name, tmp_path):
+    random = np.random.default_rng(len(name))
+    context = multiprocessing.get_context("spawn")
+    made = {"target": killed_runs.again_and_again, "args": (name, tmp_path), "daemon": True}
+    process = context.Process(**made)
+    process.start()
+    assert process.pid is not None
+    running, kept = tmp_path / "running", []
+    while len(kept) < (KILLS or 4):
+        assert process.is_alive()
+        time.sleep(random.uniform(0, 1))
+        os.kill(process.pid, signal.SIGSTOP)
+        os.waitpid(process.pid, os.WUNTRACED)  # until it has stopped
+        if (running / "begun").exists() and not (running / "found").exists():
+            left = tmp_path / f"left{len(kept)}"
+            shutil.copytree(running, left)
+            kept.append({path: path.read_bytes() for path in left.rglob("*.npz")})
+        os.kill(process.pid, signal.SIGCONT)
+    (tmp_path / "enough").touch()
+    process.join()
+    assert process.exitcode == 0
+    assert any(kept)  # else this tells nothing
+    want = (tmp_path / "whole" / "found").read_bytes()
+    for i, files in enumerate(kept):
+        assert (tmp_path / f"left{i}" / "found").read_bytes() == want
+        if name == "benchmarks":  # what was measured is not measured again
+            assert all(path.read_bytes() == content for path, content in files.items())
