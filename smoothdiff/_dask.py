@@ -8,15 +8,16 @@ import contextlib
 import logging
 import os
 import signal
+import threading
 import time
 import uuid
-import weakref
 from collections import OrderedDict
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from smoothdiff._executors import AllHangError, AtOnce, CallLostError, SuspectError
+from smoothdiff._executors import FAULTS, AllHangError, AtOnce, CallLostError, SuspectError
 from smoothdiff._host_samples import Samples
 from smoothdiff._processes import Seconds
 
@@ -30,28 +31,94 @@ _LONELY, _GLANCE, _MOMENT = 60.0, 2.0, 0.01
 _log = logging.getLogger("smoothdiff")
 
 
+class _Call(concurrent.futures.Future):
+    """A call that Dask makes, whose value is fetched together with those of others."""
+
+    def __init__(self, there: Any):
+        super().__init__()
+        self.key = there.key
+        self.there = there
+
+    def cancel(self) -> bool:
+        """Tells Dask, too."""
+        cancelled = super().cancel()
+        if cancelled and self.there.status != "cancelled":
+            self.there.cancel()
+        return cancelled
+
+    def settle(self, value: Any, error: BaseException | None) -> None:
+        """Takes what came, unless it was cancelled meanwhile."""
+        with contextlib.suppress(concurrent.futures.InvalidStateError):
+            if error is None:
+                self.set_result(value)
+            else:
+                self.set_exception(error)
+
+
+def _fetch(client: Any, calls: list[_Call]) -> None:
+    """Settles the calls as they end; the values of all that have ended by then come together."""
+    from distributed import as_completed
+
+    of = {call.there: call for call in calls}
+    try:
+        for batch in as_completed(list(of), loop=client.loop).batches():
+            good = [future for future in batch if future.status == "finished"]
+            try:
+                values = dict(zip(good, client.gather(good), strict=True))
+            except Exception:  # of one that was lost and made again
+                values = {}
+            for future in batch:
+                call = of.pop(future)
+                if future in values:
+                    call.settle(values[future], None)
+                elif future.status == "cancelled":
+                    call.cancel()
+                else:
+                    call.settle(*_ended(future))
+    except Exception as error:  # the client is closed
+        for call in of.values():
+            call.settle(None, error)
+
+
+def _ended(future: Any) -> tuple[Any, BaseException | None]:
+    """What a future of Dask's returns, and what it raises."""
+    try:
+        return future.result(), None
+    except FAULTS as error:
+        return None, error
+
+
 class OnDask(AtOnce):
     """Calls on the workers of a Dask cluster, to which large arrays are sent once."""
 
     glances_every = _GLANCE
 
     def __init__(self, client: Any):
-        # Dask takes calls of the same function with the same arguments for one call, unless they
-        # are impure; then a call that failed would never be tried again
-        super().__init__(client.get_executor(pure=False))
+        super().__init__(client)
         self._client = client
         self._sent: OrderedDict[bytes, Any] = OrderedDict()
-        self._keys: weakref.WeakKeyDictionary[Any, str] = weakref.WeakKeyDictionary()
         # of calls whose workers could not be ended
         self._hung_keys: set[str] = set()
         self._no_workers_since: float | None = None
 
-    def _submit(self, fun: Any, samples: Samples, sample: int | None, timeout: Seconds) -> Any:
-        args = (self._there(arg, samples) for arg in samples.arguments(sample))
-        key = f"{getattr(fun, '__name__', 'call')}-{uuid.uuid4()}"
-        future = self._executor.submit(fun, *args, key=key)
-        self._keys[future] = key
-        return future
+    def _submit(
+        self, fun: Any, samples: Samples, which: list[int | None], timeout: Seconds
+    ) -> Iterator[_Call]:
+        """All in one message; one for each would take most of the time of a short call."""
+        del timeout
+        name = getattr(fun, "__name__", "call")
+        keys = [f"{name}-{uuid.uuid4()}" for _ in which]
+        there = lambda sample: [self._there(arg, samples) for arg in samples.arguments(sample)]
+        columns = list(zip(*map(there, which), strict=True))
+        # Dask takes calls of the same function with the same arguments for one call, unless they
+        # are impure; then a call that failed would never be tried again
+        if columns:
+            futures = self._client.map(fun, *columns, key=keys, pure=False)
+        else:
+            futures = [self._client.submit(fun, key=key, pure=False) for key in keys]
+        calls = [_Call(future) for future in futures]
+        threading.Thread(target=_fetch, args=(self._client, calls), daemon=True).start()
+        return iter(calls)
 
     def _there(self, arg: Any, samples: Samples) -> Any:
         """An argument in which large arrays are those that the workers have."""
@@ -99,9 +166,8 @@ class OnDask(AtOnce):
                 self._client.scheduler_info().get("address", ""),
             )
 
-    def _workers(self, future: Any) -> list[str]:
-        key = self._keys[future]
-        return [worker for worker, keys in self._client.processing().items() if key in keys]
+    def _workers(self, future: _Call) -> list[str]:
+        return [name for name, keys in self._client.processing().items() if future.key in keys]
 
     def _place(self, future: Any) -> str | None:
         return next(iter(self._workers(future)), None)
@@ -114,7 +180,7 @@ class OnDask(AtOnce):
                 begun.update(*self._client.processing().values())
                 states = list(self._client.futures.items())
                 begun.update(key for key, state in states if state.status == "finished")
-        runs = [future for future in futures if not future.done() and self._keys[future] in begun]
+        runs = [future for future in futures if not future.done() and future.key in begun]
         return [future for future in futures if future in runs or not future.cancel()]
 
     def _result(self, future: Any, timeout: Seconds) -> Any:
@@ -143,7 +209,7 @@ class OnDask(AtOnce):
         kill = lambda dask_worker: os.kill(dask_worker.pid, signal.SIGKILL)
         if not self._client.run(kill, workers=workers, nanny=True, on_error="ignore"):
             self._raise_if_all_hang()
-            self._hung_keys.add(self._keys[future])
+            self._hung_keys.add(future.key)
 
     def _raise_if_all_hang(self) -> None:
         keys = self._hung_keys

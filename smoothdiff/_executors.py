@@ -10,7 +10,7 @@ import itertools
 import queue
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Iterator
 from typing import Any, NamedTuple
 
 from smoothdiff._host_samples import Samples
@@ -144,15 +144,19 @@ class AtOnce:
         tickets, patience = itertools.count(), None if self.keeps_time else timeout
         suspects: deque[_Call] = deque()
 
-        def submit(sample: int | None, tries: int, losses: int = 0, alone: bool = False) -> None:
-            ticket = next(tickets)
-            calls[ticket] = _Call(sample, tries, losses, alone)
-            try:
-                future = self._submit(fun, samples, sample, timeout)
-            except RuntimeError as error:  # it was shut down, or is broken
-                raise PoolLostError(error, [call.sample for call in calls.values()]) from error
-            calls[ticket].future = future
-            future.add_done_callback(lambda _: came.put(ticket))
+        def submit(
+            which: list[int | None], tries: int = 1, losses: int = 0, alone: bool = False
+        ) -> None:
+            futures = self._submit(fun, samples, which, timeout)
+            for sample in which:
+                ticket = next(tickets)
+                calls[ticket] = _Call(sample, tries, losses, alone)
+                try:
+                    future = next(futures)
+                except RuntimeError as error:  # it was shut down, or is broken
+                    raise PoolLostError(error, [call.sample for call in calls.values()]) from error
+                calls[ticket].future = future
+                future.add_done_callback(lambda _, ticket=ticket: came.put(ticket))
 
         def give_up(calls: Iterable[_Call], wait: float) -> None:
             of = {call.future: call.sample for call in calls if call.future is not None}
@@ -162,12 +166,11 @@ class AtOnce:
                 future.add_done_callback(functools.partial(_tell, late, of[future]))
 
         try:
-            for sample in which:
-                submit(sample, 1)
+            submit(list(which))
             while calls or suspects:
                 if not calls:
                     suspect = suspects.popleft()
-                    submit(suspect.sample, suspect.tries, suspect.losses, alone=True)
+                    submit([suspect.sample], suspect.tries, suspect.losses, alone=True)
                 ticket = self._awaited(came, calls, patience)
                 call = calls[ticket]
                 try:
@@ -179,11 +182,11 @@ class AtOnce:
                     give_up([call], 0)
                 del calls[ticket]
                 if isinstance(error, CallLostError) and call.losses < _LOSSES:
-                    submit(call.sample, call.tries, call.losses + 1, call.alone)
+                    submit([call.sample], call.tries, call.losses + 1, call.alone)
                 elif isinstance(error, SuspectError) and not call.alone:
                     suspects.append(call)
                 elif error is not None and call.tries <= retries:
-                    submit(call.sample, call.tries + 1)
+                    submit([call.sample], call.tries + 1)
                 else:
                     cause = error.__cause__ if isinstance(error, SuspectError) else error
                     yield Outcome(call.sample, call.tries, value, cause)
@@ -227,10 +230,12 @@ class AtOnce:
     def _glance(self) -> None:
         """Sees that the executor has what it needs, while nothing comes."""
 
-    def _submit(self, fun: Any, samples: Samples, sample: int | None, timeout: Seconds) -> Any:
-        """The future of a call."""
+    def _submit(
+        self, fun: Any, samples: Samples, which: list[int | None], timeout: Seconds
+    ) -> Iterator[Any]:
+        """The futures of calls."""
         del timeout
-        return self._executor.submit(fun, *samples.arguments(sample))
+        return (self._executor.submit(fun, *samples.arguments(sample)) for sample in which)
 
     def _place(self, future: Any) -> Any:
         """The worker that has a call, as far as that is known; None without one."""
@@ -263,8 +268,11 @@ class Replaced(AtOnce):
 
     keeps_time = True
 
-    def _submit(self, fun: Any, samples: Samples, sample: int | None, timeout: Seconds) -> Any:
-        return self._executor.submit_within(timeout, fun, *samples.arguments(sample))
+    def _submit(
+        self, fun: Any, samples: Samples, which: list[int | None], timeout: Seconds
+    ) -> Iterator[Any]:
+        begin = self._executor.submit_within
+        return (begin(timeout, fun, *samples.arguments(sample)) for sample in which)
 
 
 Engine = InTurn | AtOnce
