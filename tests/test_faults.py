@@ -29,6 +29,13 @@ RUNS = {"plain": 8, "threads": 1, "processes": 1, "dask": 1}
 # half the sum of squares: about 1 at the start, and without faults below this at the end
 GOOD = 1e-4
 
+# A worker that dies takes seconds to begin again, and Dask by itself gives up a call after four
+# deaths: here a fork of a process that has imported Dask, and the first.
+QUICKLY_REPLACED = {
+    "distributed.worker.multiprocessing-method": "forkserver",
+    "distributed.scheduler.allowed-failures": 0,
+}
+
 # Dask warns as its workers come and go
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
 
@@ -42,9 +49,13 @@ def executor_of(way):
         with sd.Processes(2) as workers:
             yield workers
     elif way == "dask":
-        distributed = pytest.importorskip("distributed")
+        dask, distributed = map(pytest.importorskip, ("dask", "distributed"))
         options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
-        with distributed.LocalCluster(**options) as cluster, distributed.Client(cluster) as client:
+        with (
+            dask.config.set(QUICKLY_REPLACED),
+            distributed.LocalCluster(**options) as cluster,
+            distributed.Client(cluster) as client,
+        ):
             yield client
     else:
         yield None
