@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 # The newest wants a newer Python, if there is one. Warnings are errors, but for deprecations, which
 # other packages meet, and what is said of versions that can hang
-VERSIONS = ("0.9", "newest")
+VERSIONS = ("0.9", "0.10", "newest")
 QUIET = ["-W", "error", "-W", "ignore::DeprecationWarning", "-W", "ignore:jaxlib:RuntimeWarning"]
 
 SCRIPT = """

@@ -48,7 +48,7 @@ f = sd.smooth(image, 0.2, num_samples=64, baseline="none", sampler=sd.Gaussian()
 np.testing.assert_allclose(f(key, x), jax.jit(f)(key, x), rtol=1e-5)  # outside of jit
 text = jax.jit(f).lower(key, x).compile().as_text()
 shapes = {int(rows) for rows in re.findall(r"\\[(\\d+),53\\]", text)}
-assert shapes == {64 // count}, shapes  # of all samples no device has more
+assert max(shapes) == 64 // count, shapes  # of all samples no device has more
 assert len(re.findall(r" all-reduce(?:-start)?\\(", text)) == 1, text
 
 # a solver: devices evaluate its points, and each keeps a part of the residuals of all
