@@ -1,12 +1,15 @@
-"""Many workers, simulated: rounds that wait for the slowest against a search that waits for none.
+"""Many workers: rounds that wait for the slowest against a search that waits for none.
 
 Durations are log-normal (sigma 1, mean 1), as those of simulators whose cost depends on their
 parameters. The workers of a round begin together and the next round when all are back; otherwise a
 worker gets a new point of `sd.Search` as soon as it is free. Time is simulated, so that a thousand
 workers need one core; what `ask` and `tell` cost on the host is measured, and is not in it.
+
+Then what is measured on this machine: one estimate on several devices, and calls by each executor.
 """
 
 import heapq
+import os
 import time
 from argparse import Namespace
 from collections.abc import Callable, Iterator
@@ -21,9 +24,10 @@ from tqdm import tqdm
 import smoothdiff as sd
 from benchmarks._grid import Grid
 from benchmarks._style import COLOURS, figure
+from benchmarks.studies import _devices, _workers
 from benchmarks.studies._listed import listed
 
-HELP = "4 to 1,024 simulated workers: rounds against a search that waits for none"
+HELP = "4 to 1,024 simulated workers, waiting or not; devices and processes of this machine"
 OPTIONS = ("full", "seeds")
 STARTS = {False: 1, True: 10}
 WORKERS = {False: (4, 32, 256), True: (4, 16, 64, 256, 1024)}
@@ -99,7 +103,14 @@ def measure(options: Namespace, folder: Path) -> dict[str, Any]:
             runs = [search(*FUNCTIONS[name], workers, i, way == "rounds") for i in range(starts)]
             line[way] = {of: float(np.median([run[of] for run in runs])) for of in runs[0]}
         lines.append(line)
-    return {"starts": starts, "lines": lines}
+    devices = list(tqdm(_devices.measured(), total=8, unit="line"))
+    return {
+        "starts": starts,
+        "lines": lines,
+        "cores": os.cpu_count(),
+        "devices": devices,
+        "executors": _workers.measured(),
+    }
 
 
 def tables(results: dict[str, Any]) -> Iterator[Grid]:
@@ -131,14 +142,32 @@ def tables(results: dict[str, Any]) -> Iterator[Grid]:
             for line in results["lines"]
         ],
     )
+    share = f"They share {results['cores']} cores."
+    yield listed(
+        "Devices",
+        f"One gradient; quartiles of {_devices.TURNS} calls. {share} Where CPU time stays at "
+        "100 %, sharing out costs nothing.",
+        results["devices"],
+    )
+    yield listed(
+        "Calls of a host function",
+        f"In batches of {_workers.CALLS}; quartiles of {_workers.TURNS} turns. {share}",
+        results["executors"],
+    )
 
 
 def draw(results: dict[str, Any], folder: Path) -> None:
+    """What is found of workers, and what of devices."""
+    draw_workers(results, folder / "scale.png")
+    draw_devices(results["devices"], folder / "devices.png")
+
+
+def draw_workers(results: dict[str, Any], path: Path) -> None:
     """Evaluations a second, and evaluations and seconds to the answer, against workers."""
     titles = ("a second", "Evaluations a second"), ("evaluations", "Evaluations to the answer")
     titles += (("seconds", "Seconds to the answer"),)
     names = list(dict.fromkeys(line["function"] for line in results["lines"]))
-    with figure(folder / "scale.png", 1, 3, (10, 3.6)) as (drawn, axes):
+    with figure(path, 1, 3, (10, 3.6)) as (drawn, axes):
         for axis, (of, title) in zip(axes[0], titles, strict=True):
             workers = sorted({line["workers"] for line in results["lines"]})
             for name, colour in zip(names, COLOURS, strict=False):
@@ -152,3 +181,21 @@ def draw(results: dict[str, Any], folder: Path) -> None:
             axis.set_xticks(workers, [str(count) for count in workers], minor=False)
             axis.tick_params(which="minor", bottom=False, labelbottom=False)
         drawn.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+
+
+def draw_devices(lines: list[dict[str, Any]], path: Path) -> None:
+    """How many times as fast a gradient is, and what CPU time it takes, against devices."""
+    shown = ("times as fast", "Times as fast"), ("CPU time to one device's, %", "CPU time, %")
+    with figure(path, 1, 2, (7, 3.6)) as (drawn, axes):
+        for axis, (of, title) in zip(axes[0], shown, strict=True):
+            for way, colour in zip(_devices.WAYS, COLOURS, strict=False):
+                those = [line for line in lines if line["scaling"] == way]
+                devices = [line["devices"] for line in those]
+                axis.plot(
+                    devices, [line[of] for line in those], color=colour, marker=".", label=way
+                )
+            axis.set(xscale="log", xlabel="Devices", title=title)
+            axis.set_xticks(_devices.DEVICES, map(str, _devices.DEVICES), minor=False)
+            axis.set_ylim(bottom=0)
+            axis.tick_params(which="minor", bottom=False, labelbottom=False)
+        drawn.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
