@@ -36,12 +36,21 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         for name, content in as_pages(path):
             files.append(made(config, name, content))
     for page in list(files.documentation_pages()):
+        if page.generated_by is None:
+            page.content_string = as_on_site(page.content_string, page.src_uri)
         for target in LINK.findall(page.content_string):
             name = posixpath.normpath(posixpath.join(posixpath.dirname(page.src_uri), target))
             lies = ROOT / name
             if "://" not in target and files.get_file_from_path(name) is None and lies.is_file():
                 files.append(File.generated(config, name, abs_src_path=str(lies)))
     return files
+
+
+def as_on_site(text: str, name: str) -> str:
+    """Links out of docs/ as they are on the site, where pages lie beside those of other folders."""
+    up = "../" * (name.count("/") + 1)
+    text = text.replace(f"]({up}", f"]({up.removesuffix('../')}")
+    return re.sub(r"(\]\((?:\.\./)*notebooks/[\w-]+)\.ipynb", r"\1.md", text)
 
 
 def made(config: MkDocsConfig, name: str, content: str | bytes) -> File:
