@@ -43,13 +43,16 @@ def _task(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
         raise SystemExit(
             f"{new['title']}: another {' and '.join(differ)} than in what is committed"
         )
-    methods = _in_order(old["methods"] | new["methods"])
+    # what is not able here, for want of a package say, replaces nothing
+    methods = _in_order(new["methods"] | old["methods"] | able(new))
     task = new | {"methods": methods}
     of_old, of_new = (_atlas.stored(of, list(able(of))) for of in (old, new))
     if of_old is not None and of_new is not None:
         found = of_old.found | of_new.found
         line = [of_new.start, *(found[name] for name in able(task)), of_new.reference]
         task["pictures"] = _atlas.png(np.concatenate(line))
+    else:
+        task["pictures"] = None
     films = [film for of in (old, new) if (film := of.get("film"))]
     if films:
         task["film"] = _film(films)

@@ -190,7 +190,7 @@ class Runner:
         }
 
     def _warm_up(self, solve: Solve) -> None:
-        """Runs what a run compiles: all of one, unless that takes long."""
+        """Runs what a run compiles: all of one, unless that takes longer than any may."""
         if self._problem.gradient is not None:
             self._record(solve, WARM_UP_SEED, iterations=WARM_UP_ITERATIONS)
         else:

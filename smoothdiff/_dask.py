@@ -8,21 +8,23 @@ import contextlib
 import logging
 import os
 import signal
-import threading
 import time
 import uuid
 from collections import OrderedDict
 from collections.abc import Iterator
 from typing import Any
 
+import jax
 import numpy as np
 
-from smoothdiff._executors import FAULTS, AllHangError, AtOnce, CallLostError, SuspectError
+from smoothdiff._executors import AllHangError, AtOnce, CallLostError, SuspectError
 from smoothdiff._host_samples import Samples
 from smoothdiff._processes import Seconds
 
 # bytes of an array that the workers get once and not with each call, and how many they keep
 _LARGE, _KEPT = 1_000_000, 8
+# bytes of arguments in a message, before large arrays are taken out
+_MESSAGE = 8_000_000
 # seconds without a worker after which that is said, between two looks at a cluster, and between two
 # while it is told something
 _LONELY, _GLANCE, _MOMENT = 60.0, 2.0, 0.01
@@ -31,8 +33,8 @@ _LONELY, _GLANCE, _MOMENT = 60.0, 2.0, 0.01
 _log = logging.getLogger("smoothdiff")
 
 
-class _Call(concurrent.futures.Future):
-    """A call that Dask makes, whose value is fetched together with those of others."""
+class _Awaited(concurrent.futures.Future):
+    """A call that Dask makes; what comes is taken in Dask's own loop."""
 
     def __init__(self, there: Any):
         super().__init__()
@@ -46,46 +48,21 @@ class _Call(concurrent.futures.Future):
             self.there.cancel()
         return cancelled
 
-    def settle(self, value: Any, error: BaseException | None) -> None:
-        """Takes what came, unless it was cancelled meanwhile."""
+    async def settle(self) -> None:
+        """Takes the value, or whatever a worker raised, unless it was cancelled meanwhile."""
+        value, error = None, None
+        try:
+            value = await self.there
+        except BaseException as raised:  # a worker may raise anything
+            error = raised
+        if self.there.status == "cancelled":
+            self.cancel()
+            return
         with contextlib.suppress(concurrent.futures.InvalidStateError):
             if error is None:
                 self.set_result(value)
             else:
                 self.set_exception(error)
-
-
-def _fetch(client: Any, calls: list[_Call]) -> None:
-    """Settles the calls as they end; the values of all that have ended by then come together."""
-    from distributed import as_completed
-
-    of = {call.there: call for call in calls}
-    try:
-        for batch in as_completed(list(of), loop=client.loop).batches():
-            good = [future for future in batch if future.status == "finished"]
-            try:
-                values = dict(zip(good, client.gather(good), strict=True))
-            except Exception:  # of one that was lost and made again
-                values = {}
-            for future in batch:
-                call = of.pop(future)
-                if future in values:
-                    call.settle(values[future], None)
-                elif future.status == "cancelled":
-                    call.cancel()
-                else:
-                    call.settle(*_ended(future))
-    except Exception as error:  # the client is closed
-        for call in of.values():
-            call.settle(None, error)
-
-
-def _ended(future: Any) -> tuple[Any, BaseException | None]:
-    """What a future of Dask's returns, and what it raises."""
-    try:
-        return future.result(), None
-    except FAULTS as error:
-        return None, error
 
 
 class OnDask(AtOnce):
@@ -103,22 +80,30 @@ class OnDask(AtOnce):
 
     def _submit(
         self, fun: Any, samples: Samples, which: list[int | None], timeout: Seconds
-    ) -> Iterator[_Call]:
-        """All in one message; one for each would take most of the time of a short call."""
+    ) -> Iterator[_Awaited]:
+        """Many in a message; one for each would take most of the time of a short call."""
         del timeout
         name = getattr(fun, "__name__", "call")
-        keys = [f"{name}-{uuid.uuid4()}" for _ in which]
-        there = lambda sample: [self._there(arg, samples) for arg in samples.arguments(sample)]
-        columns = list(zip(*map(there, which), strict=True))
-        # Dask takes calls of the same function with the same arguments for one call, unless they
-        # are impure; then a call that failed would never be tried again
-        if columns:
-            futures = self._client.map(fun, *columns, key=keys, pure=False)
-        else:
-            futures = [self._client.submit(fun, key=key, pure=False) for key in keys]
-        calls = [_Call(future) for future in futures]
-        threading.Thread(target=_fetch, args=(self._client, calls), daemon=True).start()
-        return iter(calls)
+        for some in self._messages([samples.arguments(sample) for sample in which]):
+            there = [[self._there(arg, samples) for arg in args] for args in some]
+            columns = list(zip(*there, strict=True))
+            keys = [f"{name}-{uuid.uuid4()}" for _ in some]
+            # Dask takes calls of the same function with the same arguments for one call, unless
+            # they are impure; then a call that failed would never be tried again
+            if columns:
+                futures = self._client.map(fun, *columns, key=keys, pure=False)
+            else:
+                futures = [self._client.submit(fun, key=key, pure=False) for key in keys]
+            calls = [_Awaited(future) for future in futures]
+            for call in calls:
+                self._client.loop.add_callback(call.settle)
+            yield from calls
+
+    def _messages(self, calls: list[Any]) -> Iterator[list[Any]]:
+        """The calls, as many at a time as make no large message."""
+        size = sum(part.nbytes for part in jax.tree.leaves(calls[:1]) if hasattr(part, "nbytes"))
+        count = max(1, _MESSAGE // max(1, size))
+        return (calls[i : i + count] for i in range(0, len(calls), count))
 
     def _there(self, arg: Any, samples: Samples) -> Any:
         """An argument in which large arrays are those that the workers have."""
@@ -166,7 +151,7 @@ class OnDask(AtOnce):
                 self._client.scheduler_info().get("address", ""),
             )
 
-    def _workers(self, future: _Call) -> list[str]:
+    def _workers(self, future: _Awaited) -> list[str]:
         return [name for name, keys in self._client.processing().items() if future.key in keys]
 
     def _place(self, future: Any) -> str | None:

@@ -38,6 +38,17 @@ def a_while(x):
     return x
 
 
+class Stopped(BaseException):
+    """What no function should raise."""
+
+
+def stops_if_negative(x):
+    """Raises what is no Exception."""
+    if x < 0:
+        raise Stopped("negative")
+    return 2 * x
+
+
 def fails_if_negative(x):
     """Takes |x| seconds."""
     time.sleep(abs(float(x)))

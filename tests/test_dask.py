@@ -57,6 +57,20 @@ def test_a_call_that_failed_is_tried_again(way, client, tmp_path):
     assert flaky.tries() == {0.0: 2, 1.0: 2, 2.0: 2}
 
 
+def test_a_worker_may_raise_anything(client):
+    f = box(client, host_functions.stops_if_negative)
+    with pytest.raises(host_functions.Stopped, match="negative"):
+        jax.block_until_ready(jax.vmap(f)(jnp.array([0.5, -1.0, 0.25])))
+
+
+@pytest.mark.parametrize("size", [2, 3])
+def test_calls_go_out_in_few_messages(size, client, monkeypatch):
+    monkeypatch.setattr("smoothdiff._dask._MESSAGE", 2 * size * 4)
+    f = sd.black_box(np.sum, 0.0, executor=client)
+    xs = jnp.arange(5.0 * size).reshape(5, size)
+    np.testing.assert_array_equal(jax.vmap(f)(xs), xs.sum(1))
+
+
 def test_what_runs_when_another_call_fails_is_kept(client, tmp_path):
     f = box(client, host_functions.fails_if_negative, store=tmp_path / "store")
     with pytest.raises(sd.BlackBoxError, match="sample 0 of 22: raised ValueError: negative"):

@@ -91,11 +91,13 @@ def test_what_a_kill_would_leave_at_any_moment_is_taken_up_to_the_same_bits(name
         time.sleep(random.uniform(0, 1))
         os.kill(process.pid, signal.SIGSTOP)
         os.waitpid(process.pid, os.WUNTRACED)  # until it has stopped
-        if (running / "begun").exists() and not (running / "found").exists():
-            left = tmp_path / f"left{len(kept)}"
-            shutil.copytree(running, left)
-            kept.append({path: path.read_bytes() for path in left.rglob("*.npz")})
-        os.kill(process.pid, signal.SIGCONT)
+        try:
+            if (running / "begun").exists() and not (running / "found").exists():
+                left = tmp_path / f"left{len(kept)}"
+                shutil.copytree(running, left)
+                kept.append({path: path.read_bytes() for path in left.rglob("*.npz")})
+        finally:
+            os.kill(process.pid, signal.SIGCONT)
     (tmp_path / "enough").touch()
     process.join()
     assert process.exitcode == 0

@@ -49,7 +49,7 @@ EXECUTORS: dict[str, Callable[[], Any]] = {
     "2 processes": lambda: sd.Processes(2),
     "Dask, 2 processes": dask,
 }
-ALONE, PAIR = "1 process", "2 processes"
+ALONE = "1 process"
 
 
 def measured() -> list[dict[str, Any]]:

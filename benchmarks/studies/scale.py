@@ -103,7 +103,9 @@ def measure(options: Namespace, folder: Path) -> dict[str, Any]:
             runs = [search(*FUNCTIONS[name], workers, i, way == "rounds") for i in range(starts)]
             line[way] = {of: float(np.median([run[of] for run in runs])) for of in runs[0]}
         lines.append(line)
-    devices = list(tqdm(_devices.measured(), total=8, unit="line"))
+    devices = list(
+        tqdm(_devices.measured(), total=len(_devices.DEVICES) * len(_devices.WAYS), unit="line")
+    )
     return {
         "starts": starts,
         "lines": lines,

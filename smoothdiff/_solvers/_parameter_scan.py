@@ -92,7 +92,7 @@ class Scan(eqx.Module):
     def propose(
         self, low: Float[Array, " n"], high: Float[Array, " n"], count: int
     ) -> Float[Array, "K n"]:
-        """So many points along the parameter, its bounds first, or both best places together."""
+        """So many points along the parameter, its bounds first, or the point of the test."""
         n = len(self.base)
         at = jnp.minimum(self.line, n - 1)
         slot = self.taken + jnp.arange(count)
@@ -117,7 +117,8 @@ class Scan(eqx.Module):
         _, best = jax.lax.top_k(ease, min(count, len(ease)))
         best = jnp.resize(best, (count,))
         middles = (places[best] + places[best + 1]) / 2
-        return jnp.where(jnp.isfinite(middles), middles, self.base[0])
+        at = jnp.minimum(self.line, len(self.base) - 1)
+        return jnp.where(jnp.isfinite(middles), middles, self.base[at])
 
     def _known(self) -> tuple[Array, Array]:
         """The base and all others of this line; those that are not there yet are infinite."""

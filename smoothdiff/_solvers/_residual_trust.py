@@ -48,7 +48,8 @@ _SHORTER, _SMOOTH = 0.6, 0.8
 class Proposal(NamedTuple):
     """Steps to evaluate, in units of sigma, and what the model says of them.
 
-    Without the radius a step of one sigma would reduce the loss by what is `ahead`.
+    A step of one sigma, or as long as the radius if that is more, would reduce the loss by what is
+    `ahead`.
     """
 
     steps: Float[Array, "K n"]
@@ -188,8 +189,8 @@ class TrustRegion(eqx.Module):
         same = jnp.all(rows[best] == row)
         outcome = ratio_test(before, fun, reduction, self.fails)
         # what is far ahead of a radius that failures made small has not converged
-        more = outcome.more | (proposal.ahead > taken_by_rounding(before))
-        outcome = outcome._replace(more=more)
+        promised = outcome.more | (proposal.ahead > taken_by_rounding(before))
+        outcome = outcome._replace(more=promised)
         tried, failed, held, long, fails, _ = outcome
         radii = self.radius * powers_of_two(len(funs), length.dtype)
         shorter = (self.fails > 0) & (length < _SHORTER * self.length)

@@ -261,7 +261,9 @@ class ValueSearch(AbstractPointSearch):
         branches = [first, local, wide, lambda: known.piloted(params, new)]
         if (scan := self.scan) is not None:
             funs = jnp.where(new.valid, new.funs, jnp.inf)
-            branches.append(lambda: known._scanned(params, scan.after(new.points, funs), sizes))
+            # neither model's turn
+            apart = dataclasses.replace(known, turn=self.turn)
+            branches.append(lambda: apart._scanned(params, scan.after(new.points, funs), sizes))
         return by_stage(self.stage, stage, branches)
 
     def _scanned(self, params: Params, scan: Scan, sizes: Sizes) -> "ValueSearch":

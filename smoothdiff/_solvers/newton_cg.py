@@ -91,10 +91,11 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         restarts: how many searches may follow: for functions with several minima. Within bounds a
             first search that is long on wide samples, or else the second, tries each parameter
             alone, from bound to bound. That ends after 33 evaluations unless the parameters act
-            independently. All other searches are of wide samples alone: one of four
-            begins at the first point, the others anywhere within the bounds, without bounds around
-            the best point so far, as wide as chance has it. With batches all begin at the first
-            point. The best point of all is returned.
+            independently. Then it goes on with 50, later 100 and 200, for each parameter. All other
+            searches are of wide samples alone: one of four begins at the first point, the others
+            anywhere within the bounds, without bounds around the best point so far, as wide as
+            chance has it. With batches all begin at the first point. The best point of all is
+            returned.
 
     Raises:
         ValueError: no evaluation in a step, fewer kept ones than two, a patience of none, negative

@@ -110,11 +110,9 @@ def _bar(answer: _finder.Answer, cost: str) -> dict[str, Any]:
     """How many times as fast, as a bar from one, in percent of the track."""
     found = answer.tally(cost)
     of = found.mean
-    if not answer.comparable(cost):
-        return {"cost": cost, "width": None, "interval": "", "low": None} | {
-            "told": "not measured on one machine"
-        }
     bar: dict[str, Any] = {"cost": cost, "width": None, "interval": "", "low": None}
+    if not answer.comparable(cost):
+        return bar | {"told": "not measured on one machine"}
     if of is None:
         ours, theirs = answer.solved
         only = answer.ours if ours else answer.peer.name
