@@ -36,7 +36,7 @@ from smoothdiff._solvers._regression_step import Center
 from smoothdiff._solvers._turns import Turn
 
 # a first search is long after so many evaluations for each parameter, and one
-_LONG = 30
+_LONG = 60
 # of so many later searches one begins at the start
 _PATIENT = 4
 # the widths of later searches, in sigma, as powers of ten at random
