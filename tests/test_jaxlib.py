@@ -2,12 +2,15 @@
 
 import os
 import re
+import subprocess
+import sys
 import warnings
 from collections import Counter
 
 import jax
 import jax.numpy as jnp
 import pytest
+from pages import ROOT
 
 import smoothdiff as sd
 from smoothdiff import _jaxlib
@@ -88,3 +91,11 @@ def test_a_fit_to_several_outputs_has_one_solve(baseline):
         return Counter(re.findall(rf"= ({LAPACK})\b", text))
 
     assert solves(fun) == solves(lambda x: jnp.sum(jnp.abs(x))) != {}
+
+
+@pytest.mark.slow
+def test_benchmarks_take_threads_and_do_not_warn():
+    """Whatever jaxlib is installed: where it can hang, with more threads than there are cores."""
+    environment = {name: value for name, value in os.environ.items() if name != "NPROC"}
+    asked = [sys.executable, "-W", "error::RuntimeWarning", "-c", "import benchmarks._task"]
+    subprocess.run(asked, env=environment, cwd=ROOT, check=True)
