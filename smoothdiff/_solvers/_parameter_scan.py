@@ -95,7 +95,7 @@ class Scan(eqx.Module):
         """So many points along the parameter, its bounds first, or the point of the test."""
         n = len(self.base)
         at = jnp.minimum(self.line, n - 1)
-        slot = self.taken + jnp.arange(count)
+        slot = self.taken + jnp.arange(count, dtype=self.taken.dtype)
         places = jnp.where(slot == 0, low[at], high[at])
         places = jnp.where(slot < 2, places, self._easiest(count))
         line = jnp.broadcast_to(self.base, (count, n)).at[:, at].set(places)
@@ -148,7 +148,7 @@ class Scan(eqx.Module):
     def _lined(self, points: Array, funs: Array) -> "Scan":
         n, count = len(self.base), len(funs)
         at = jnp.minimum(self.line, n - 1)
-        place = jnp.minimum(self.taken + jnp.arange(count), _MOST - 1)
+        place = jnp.minimum(self.taken + jnp.arange(count, dtype=self.taken.dtype), _MOST - 1)
         known = eqx.tree_at(
             lambda s: (s.places, s.funs, s.taken),
             self,
