@@ -123,6 +123,15 @@ class Params:
         """The point that the function may see: within the bounds, if there are any."""
         return x if self.low is None else jnp.clip(x, self.low, self.high)
 
+    def reflected(self, x: Array) -> Array:
+        """The sample that the function may see: reflected where a bound is crossed."""
+        if self.low is None or self.high is None:
+            return self.clip(x)
+        beyond = jnp.where(
+            x < self.low, 2 * self.low - x, jnp.where(x > self.high, 2 * self.high - x, x)
+        )
+        return self.clip(beyond)
+
 
 def layout_of(y: PyTree[Array]) -> Layout:
     """That of parameters of which all are smoothed."""

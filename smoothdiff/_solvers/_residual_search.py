@@ -95,6 +95,17 @@ class ResidualSearch(AbstractPointSearch):
         """Whether it converged, or so many evaluations in a row were no lower."""
         return self.converged() | (self.stale >= sizes.patience)
 
+    def counted(
+        self, small: Array, check: Array, lower: Array, least: Array, count: int
+    ) -> "ResidualSearch":
+        """Before the minimum of a ripple is taken for the answer, wide rounds look around once."""
+        after = super().counted(small, check, lower, least, count)
+        unseen = (self.wide.rounds == 0) & self.is_local() & self.trust.of_ripple()
+        doubt = after.converged() & unseen & ~least
+        around = after._to_wide(jnp.ones_like(self.wide.scale))
+        around = eqx.tree_at(lambda s: s.small, around, jnp.zeros_like(self.small))
+        return where(doubt, around, after)
+
     def round(self) -> Int[Array, ""]:
         """So many wide rounds."""
         return self.wide.rounds
@@ -164,9 +175,8 @@ class ResidualSearch(AbstractPointSearch):
             wide, samples = self.wide, draw(max(sizes.first - 1, 1))
             at = wide.taken + slot
             width = sigma * wide.scale
-            points = (
-                wide.center[None] + width[None] * samples[jnp.clip(at - 1, 0, len(samples) - 1)]
-            )
+            samples = samples[jnp.clip(at - 1, 0, len(samples) - 1)]
+            points = jax.vmap(params.reflected)(wide.center[None] + width[None] * samples)
             step, worth = further(wide.move, width)
             points = jnp.where(((at == 1) & worth)[:, None], (wide.center + step)[None], points)
             return jnp.where((at == 0)[:, None], wide.center[None], points), nothing

@@ -31,6 +31,8 @@ _PREDICTED = 0.5
 _COVERED = 0.2
 # ... and evaluations cover the region, or this share of what the fit uses
 _CLOSE = 0.05
+# a model that holds no further than so many sigmas may be that of a ripple
+_RIPPLE = 0.01
 # the radius after a failure, in lengths of the step
 _SMALLEST, _LARGEST = 0.1, 0.5
 # so many steps in a row that fail, or fail and are rough, are too many; of the latter one, where no
@@ -69,7 +71,8 @@ class TrustRegion(eqx.Module):
     one before and predicted no better, as happens where a function jumps, or changed nothing at
     all; `error` and `length` are those of the last one. `worked` says that some step did not fail,
     and `slow` counts the evaluations in a row that lowered the loss by little or nothing, while the
-    radius did not grow. The last step may be `settled`, see there.
+    radius did not grow. The last step may be `settled`, see there. `foreseen` is the length of the
+    longest step whose end was as predicted.
     """
 
     radius: Float[Array, ""]
@@ -82,6 +85,7 @@ class TrustRegion(eqx.Module):
     worked: Bool[Array, ""]
     slow: Int[Array, ""]
     settled: Bool[Array, ""]
+    foreseen: Float[Array, ""]
 
     @staticmethod
     def start(radius: Float[Array, ""], n: int, size: int) -> "TrustRegion":
@@ -89,7 +93,7 @@ class TrustRegion(eqx.Module):
         none, zero = jnp.zeros((), jnp.int32), jnp.zeros_like(radius)
         jacobian = jnp.zeros((n, size), radius.dtype)
         no = jnp.asarray(False)
-        return TrustRegion(radius, jacobian, no, none, none, zero, zero, no, none, no)
+        return TrustRegion(radius, jacobian, no, none, none, zero, zero, no, none, no, zero)
 
     def failed(self) -> Bool[Array, ""]:
         """Whether a local model is of no use."""
@@ -98,6 +102,10 @@ class TrustRegion(eqx.Module):
             | (self.slow >= _SLOW * (len(self.jacobian) + 1))
             | (self.rough >= jnp.where(self.worked, _ROUGH, 1))
         )
+
+    def of_ripple(self) -> Bool[Array, ""]:
+        """Whether only ripples far shorter than sigma were predicted, and failures led there."""
+        return (self.foreseen < _RIPPLE) & (self.radius < _RIPPLE)
 
     def resumed(self) -> "TrustRegion":
         """After a turn of the other model: what failed before no longer counts."""
@@ -219,6 +227,7 @@ class TrustRegion(eqx.Module):
             slow=jnp.where((fun < (1 - _LITTLE) * before) | grow, 0, self.slow + len(rows)),
             worked=self.worked | (tried & ~failed),
             settled=settled(self.settled, outcome, length, radii[best]),
+            foreseen=jnp.where(grow, jnp.maximum(self.foreseen, length), self.foreseen),
         )
         return revised
 

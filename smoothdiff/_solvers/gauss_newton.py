@@ -48,7 +48,7 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
       reduction is as predicted, and shrinks if the loss does not fall.
     - **The wide regression** takes over on functions that jump: when steps fail in a row, when a
       shorter step is predicted no better than a longer one, or when no residual changes. It samples
-      rounds of points around a center, which may go uphill:
+      rounds of points around a center, which may go uphill, reflected at the bounds:
 
     $$ r(y + \sigma u) \approx m + J u + e, \qquad
        u = -(J^T \Gamma^{-1} J + I)^{-1} J^T \Gamma^{-1} m $$
@@ -89,7 +89,9 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             tried may be anything.
         rtol: relative tolerance. The run has converged when three steps in a row are below
             `atol + rtol * max(norm(y), norm(sigma))`, unless only the radius made them short, or
-            they failed where the model promised more than rounding may take.
+            they failed where the model promised more than rounding may take. Where no step as long
+            as a hundredth of sigma was predicted, that may be a ripple's minimum: wide rounds look
+            around first.
         atol: absolute tolerance. With both zero no run converges; else the tolerance is at least
             the root of the rounding of `max(norm(y), norm(sigma))`.
         norm: the norm of steps and iterates.
