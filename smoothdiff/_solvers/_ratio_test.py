@@ -13,6 +13,8 @@ _FAR_OFF = 10.0
 _INSIDE = 0.95
 # a reduction of so many roundings of the value is nothing, a rise of so many is one for sure
 _NOTHING, TELLING = 8, 1000
+# points are near each other within so many sigmas
+_NARROW = 1e-3
 
 
 class Outcome(NamedTuple):
@@ -72,6 +74,38 @@ def ratio_test(
 def taken_by_rounding(fun: Float[Array, ""]) -> Float[Array, ""]:
     """So much of a reduction may be rounding."""
     return jnp.sqrt(jnp.finfo(fun.dtype).eps) * jnp.abs(fun)
+
+
+def is_lower(fun: Float[Array, ""], before: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether a value is lower than another by more than rounding."""
+    return before - fun > _NOTHING * jnp.finfo(fun.dtype).eps * jnp.abs(before)
+
+
+def is_narrow(width: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether points so many sigmas apart are near each other."""
+    return width < _NARROW
+
+
+def rounding_alone(
+    funs: Float[Array, " K"], valid: Bool[Array, " K"], width: Float[Array, ""]
+) -> Bool[Array, ""]:
+    """Whether values of points that are near each other differ by rounding alone.
+
+    Then there are more of them than levels between the lowest and the highest.
+
+    Args:
+        funs: The values.
+        valid: Which of them count.
+        width: How far apart the points are, in units of sigma.
+    """
+    levels = jnp.sort(jnp.where(valid, funs, jnp.inf))
+    gaps = jnp.diff(levels)
+    unit = jnp.min(jnp.where((gaps > 0) & jnp.isfinite(gaps), gaps, jnp.inf))
+    highest = jnp.max(jnp.where(valid, funs, -jnp.inf))
+    spread = highest - levels[0]
+    few = spread < (jnp.sum(valid) - 1).astype(unit.dtype) * unit
+    little = spread <= taken_by_rounding(highest)
+    return few & little & is_narrow(width)
 
 
 def settled(

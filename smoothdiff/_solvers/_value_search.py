@@ -32,6 +32,7 @@ from smoothdiff._solvers._point_search import (
     where,
 )
 from smoothdiff._solvers._quadratic_trust import Proposal, QuadraticTrust
+from smoothdiff._solvers._ratio_test import is_lower, is_narrow, rounding_alone
 from smoothdiff._solvers._regression_step import Center
 from smoothdiff._solvers._turns import Turn
 
@@ -39,6 +40,8 @@ from smoothdiff._solvers._turns import Turn
 _LONG = 60
 # of so many later searches one begins at the start
 _PATIENT = 4
+# so many steps or evaluations that led nowhere are enough for any patience
+_ENOUGH = 2**24
 # the widths of later searches, in sigma, as powers of ten at random
 _NARROWEST, _WIDEST = -1.5, 0.3
 
@@ -52,12 +55,14 @@ class ValueSearch(AbstractPointSearch):
     like the first. A patient search never goes back to the lowest sample: what is lowest by chance
     does not lead it away from where the smoothed function is low. Nor does any search where the
     function is `noisy`: where it gave another value for the same point, which the first round of
-    samples begins with.
+    samples begins with. `idle` counts the evaluations that lowered its lowest value by no more than
+    rounding.
     """
 
     steps: Float[Array, " n"]
     scan: Scan | None
     searches: Int[Array, ""]
+    idle: Int[Array, ""]
     noisy: Bool[Array, ""]
     trust: QuadraticTrust
     center: Center
@@ -90,6 +95,7 @@ class ValueSearch(AbstractPointSearch):
             steps=width * sigma,
             scan=None,
             searches=none,
+            idle=none,
             noisy=jnp.asarray(False),
             trust=QuadraticTrust.start(sigma, width),
             center=center,
@@ -154,7 +160,9 @@ class ValueSearch(AbstractPointSearch):
 
     def lost(self, sizes: Sizes) -> Bool[Array, ""]:
         """Whether neither model leads anywhere; after one converged the wide one may yet."""
-        lost = self.center.lost(sizes) & (self.trust.failed() | self._later())
+        narrow = is_narrow(self.center.trust.width) & ~self.noisy
+        lost = self.center.lost(sizes) | (narrow & (self.idle >= sizes.patience))
+        lost &= self.trust.failed() | self._later()
         return lost if self.scan is None else lost | (self.scan.failed & (self.stage == SCAN))
 
     def _patient(self, searches: Int[Array, ""]) -> Bool[Array, ""]:
@@ -239,7 +247,10 @@ class ValueSearch(AbstractPointSearch):
         """The search with these new evaluations."""
         before = self.history.best(self.start)[2]
         known = self.kept(new)
-        known = eqx.tree_at(lambda s: s.turn, known, self.turn.more(sizes.step))
+        lower = is_lower(known.history.best(self.start)[2], before)
+        idle = jnp.where(lower, 0, self.idle + sizes.step)
+        turn = self.turn.more(sizes.step)
+        known = eqx.tree_at(lambda s: (s.turn, s.idle), known, (turn, idle))
 
         def first() -> "ValueSearch":
             enough = self.evaluated + sizes.step > 2 * len(self.start)
@@ -249,13 +260,15 @@ class ValueSearch(AbstractPointSearch):
 
         def local() -> "ValueSearch":
             trust = self.trust.revise(proposal, before, new.funs, new.valid)
+            slow = jnp.where(known._at_bottom(sizes, self.trust.radius), _ENOUGH, trust.slow)
+            trust = eqx.tree_at(lambda t: t.slow, trust, slow)
             return eqx.tree_at(lambda s: s.trust, known, trust)._turned(params, sizes)
 
         def wide() -> "ValueSearch":
             taken = self.taken + sizes.step
             noisy = self.noisy | (self._checks() & new.valid[0] & differ(new.funs[0], before))
             more = eqx.tree_at(lambda s: (s.taken, s.noisy), known, (taken, noisy))
-            full = lambda: more._stepped(params)._turned(params, sizes)
+            full = lambda: more._stepped(params, sizes)._turned(params, sizes)
             return jax.lax.cond(taken >= sizes.first, full, lambda: more)
 
         branches = [first, local, wide, lambda: known.piloted(params, new)]
@@ -280,7 +293,12 @@ class ValueSearch(AbstractPointSearch):
         """Whether a point is evaluated again that was evaluated before."""
         return (self.rounds == 0) & (self.taken == 0)
 
-    def _stepped(self, params: Params) -> "ValueSearch":
+    def _at_bottom(self, sizes: Sizes, width: Float[Array, ""]) -> Bool[Array, ""]:
+        """Whether the last evaluations, so far apart, say that nothing lower is near."""
+        funs, valid = self.history.funs[-sizes.first :], self.history.valid[-sizes.first :]
+        return rounding_alone(funs, valid, width)
+
+    def _stepped(self, params: Params, sizes: Sizes) -> "ValueSearch":
         """The next center, from all samples."""
         history, average = self.history, self.average
         keyed, known = average is not None, (history.points, history.funs, history.valid)
@@ -289,6 +307,10 @@ class ValueSearch(AbstractPointSearch):
         # a metric can overflow where the function is flat
         finite = all_finite((center.theta, center.metric, center.trust.width))
         center = where(finite, center, self.center)
+        stall = jnp.where(
+            self._at_bottom(sizes, self.center.trust.width), _ENOUGH, center.trust.stall
+        )
+        center = eqx.tree_at(lambda c: c.trust.stall, center, stall)
         new = center, jnp.zeros_like(self.taken), self.rounds + 1
         after = eqx.tree_at(lambda s: (s.center, s.taken, s.rounds), self, new)
         return after if average is None else after.with_mean(average.after(center.theta))

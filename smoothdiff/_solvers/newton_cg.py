@@ -86,8 +86,9 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
             the root of the rounding of `max(norm(y), norm(sigma))`.
         norm: the norm of steps and iterates.
         patience: a search ends after so many evaluations in a row in which the wide model led
-            nowhere, if the local one does not either; by default 20 (n + 1). With batches it counts
-            steps, by default 30.
+            nowhere, if the local one does not either; by default 20 (n + 1). Within a thousandth of
+            sigma, so many without a lower point are enough, and a model is done at once where
+            values differ by rounding alone. With batches it counts steps, by default 30.
         restarts: how many searches may follow: for functions with several minima. Within bounds a
             first search that is long on wide samples, or else the second, tries each parameter
             alone, from bound to bound. That ends after 33 evaluations unless the parameters act
