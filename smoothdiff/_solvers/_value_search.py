@@ -12,29 +12,26 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
 from smoothdiff._params import Params
 from smoothdiff._solvers._base import all_finite
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import differ
-from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._parameter_scan import Scan, bounds_of
-from smoothdiff._solvers._pilot import Pilot
 from smoothdiff._solvers._point_search import (
     FIRST,
     SCAN,
     TRUST,
     WIDE,
-    AbstractPointSearch,
     Sizes,
     by_stage,
     where,
 )
-from smoothdiff._solvers._quadratic_trust import Proposal, QuadraticTrust
-from smoothdiff._solvers._ratio_test import is_lower, is_narrow, rounding_alone
-from smoothdiff._solvers._regression_step import Center
+from smoothdiff._solvers._quadratic_trust import Proposal
+from smoothdiff._solvers._ratio_test import is_lower
 from smoothdiff._solvers._turns import Turn
+from smoothdiff._solvers._value_state import ValueState
 
 # a first search is long after so many evaluations for each parameter, and one
 _LONG = 60
@@ -46,149 +43,8 @@ _ENOUGH = 2**24
 _NARROWEST, _WIDEST = -1.5, 0.3
 
 
-class ValueSearch(AbstractPointSearch):
-    """Where a search stands, with the local model and the center of the wide samples.
-
-    Those after the first, which `searches` counts, are the wide model's alone, in turns a patient
-    one at the start and some elsewhere. A `scan` of the parameters, one by one, if there is one, is
-    tried in a first search that is long, or else before the second; what that finds is searched
-    like the first. A patient search never goes back to the lowest sample: what is lowest by chance
-    does not lead it away from where the smoothed function is low. Nor does any search where the
-    function is `noisy`: where it gave another value for the same point, which the first round of
-    samples begins with. `idle` counts the evaluations that lowered its lowest value by no more than
-    rounding.
-    """
-
-    steps: Float[Array, " n"]
-    scan: Scan | None
-    searches: Int[Array, ""]
-    idle: Int[Array, ""]
-    noisy: Bool[Array, ""]
-    trust: QuadraticTrust
-    center: Center
-    taken: Int[Array, ""]
-    rounds: Int[Array, ""]
-    turn: Turn
-
-    @staticmethod
-    def of(
-        params: Params,
-        theta: Float[Array, " n"],
-        sigma: Float[Array, " n"],
-        width: Array,
-        history: History,
-    ) -> "ValueSearch":
-        """Nothing is known but what is in the history; the first samples are so wide."""
-        none, n = jnp.zeros((), jnp.int32), len(theta)
-        center = Center.start(theta, Metric.of(sigma, True))
-        center = eqx.tree_at(lambda c: c.trust.width, center, width)
-        never = jnp.zeros_like(width)
-        return ValueSearch(
-            stage=jnp.asarray(FIRST, jnp.int32),
-            history=history,
-            start=theta,
-            evaluated=none,
-            small=none,
-            stale=none,
-            pilot=Pilot.start(theta),
-            average=None,
-            steps=width * sigma,
-            scan=None,
-            searches=none,
-            idle=none,
-            noisy=jnp.asarray(False),
-            trust=QuadraticTrust.start(sigma, width),
-            center=center,
-            taken=none,
-            rounds=none,
-            turn=Turn.start(n, never),
-        )
-
-    def again(
-        self,
-        params: Params,
-        theta: Float[Array, " n"],
-        start: Float[Array, " n"],
-        lowest: tuple[Float[Array, " n"], Float[Array, ""]],
-        key: Array,
-    ) -> "ValueSearch":
-        """Another search: in turns a patient one at the start, and some elsewhere of any width.
-
-        It begins with a scan of the parameters, if one is due.
-        """
-        empty = jax.tree.map(jnp.zeros_like, self.history)
-        searches = self.searches + 1
-        here = self._patient(searches)
-        power = jax.random.uniform(key, (), theta.dtype, _NARROWEST, _WIDEST)
-        theta, width = jnp.where(here, start, theta), jnp.where(here, 1, 10**power)
-        anew = ValueSearch.of(params, theta, params.sigma, width, empty)
-        stage = jnp.full_like(self.stage, WIDE)
-        if self.scan is not None:
-            scan, scans = self.scan.next(params, *lowest)
-            anew = dataclasses.replace(anew, scan=scan)
-            stage = jnp.where(scans, SCAN, stage).astype(stage.dtype)
-        changed = stage, self.rounds + 1, searches, self.noisy
-        return eqx.tree_at(lambda s: (s.stage, s.rounds, s.searches, s.noisy), anew, changed)
-
-    def widened(
-        self, params: Params, theta: Float[Array, " n"], width: Float[Array, ""]
-    ) -> "ValueSearch":
-        """With all first points again."""
-        return self._anew(params, theta, params.sigma, width)
-
-    def _anew(self, params: Params, theta: Array, sigma: Array, width: Array) -> "ValueSearch":
-        """The same search from another point, with all that was evaluated."""
-        names = "pilot", "average", "searches", "rounds", "noisy", "scan"
-        anew = ValueSearch.of(params, theta, sigma, width, self.history)
-        return dataclasses.replace(anew, **{name: getattr(self, name) for name in names})
-
-    def settled(self) -> Bool[Array, ""]:
-        """The local model's may be none."""
-        return ~self.is_local() | self.trust.settled
-
-    def checking(self) -> Bool[Array, ""]:
-        """The local model alone has checks."""
-        return self.is_local() & self.trust.check
-
-    def checked(self) -> "ValueSearch":
-        """With a check as the local model's next point."""
-        return eqx.tree_at(lambda s: s.trust.check, self, self.is_local())
-
-    def right(self) -> Bool[Array, ""]:
-        """The local model alone has checks."""
-        return self.is_local() & self.trust.right
-
-    def lost(self, sizes: Sizes) -> Bool[Array, ""]:
-        """Whether neither model leads anywhere; after one converged the wide one may yet."""
-        narrow = is_narrow(self.center.trust.width) & ~self.noisy
-        lost = self.center.lost(sizes) | (narrow & (self.idle >= sizes.patience))
-        lost &= self.trust.failed() | self._later()
-        return lost if self.scan is None else lost | (self.scan.failed & (self.stage == SCAN))
-
-    def _patient(self, searches: Int[Array, ""]) -> Bool[Array, ""]:
-        """Whether the search with this number is a patient one."""
-        return searches % _PATIENT == (1 if self.scan is None else 2)
-
-    def _later(self) -> Bool[Array, ""]:
-        """Whether there are wide samples alone."""
-        scanned = jnp.asarray(False) if self.scan is None else self.scan.done()
-        return ((self.searches if self.average is None else self.rounds) > 0) & ~scanned
-
-    def width(self) -> Float[Array, ""]:
-        """The radius, or the width of the samples."""
-        return jnp.where(self.stage == WIDE, self.center.trust.width, self.trust.radius)
-
-    def candidates(self) -> list[Float[Array, " n"]]:
-        """With noise, the lowest point owes much to luck, and the center little."""
-        return [self.center.theta] if self.average is None else super().candidates()
-
-    def round(self) -> Int[Array, ""]:
-        """So many rounds of samples."""
-        return self.rounds
-
-    def smoothing(self) -> Float[Array, ""]:
-        """Half the trace of the model's Hessian."""
-        return jnp.trace(self.trust.hessian) * self.width() ** 2 / 2
+class ValueSearch(ValueState):
+    """What is evaluated next, and what that teaches: two models in turns, and a scan."""
 
     def propose(
         self,
@@ -228,7 +84,7 @@ class ValueSearch(AbstractPointSearch):
             z = draw(sizes.first)[jnp.minimum(self.taken + slot, sizes.first - 1)]
             points = jax.vmap(lambda z: self.center.sample(params, z))(z)
             best, *_ = self.history.best(self.start)
-            return points.at[0].set(jnp.where(self._checks(), best, points[0])), nothing
+            return points.at[0].set(jnp.where(self.checks_noise(), best, points[0])), nothing
 
         further = lambda: (self.pilot_points(params, draw, count), nothing)
         branches = [first, local, wide, further]
@@ -260,13 +116,13 @@ class ValueSearch(AbstractPointSearch):
 
         def local() -> "ValueSearch":
             trust = self.trust.revise(proposal, before, new.funs, new.valid)
-            slow = jnp.where(known._at_bottom(sizes, self.trust.radius), _ENOUGH, trust.slow)
+            slow = jnp.where(known.at_bottom(sizes, self.trust.radius), _ENOUGH, trust.slow)
             trust = eqx.tree_at(lambda t: t.slow, trust, slow)
             return eqx.tree_at(lambda s: s.trust, known, trust)._turned(params, sizes)
 
         def wide() -> "ValueSearch":
             taken = self.taken + sizes.step
-            noisy = self.noisy | (self._checks() & new.valid[0] & differ(new.funs[0], before))
+            noisy = self.noisy | (self.checks_noise() & new.valid[0] & differ(new.funs[0], before))
             more = eqx.tree_at(lambda s: (s.taken, s.noisy), known, (taken, noisy))
             full = lambda: more._stepped(params, sizes)._turned(params, sizes)
             return jax.lax.cond(taken >= sizes.first, full, lambda: more)
@@ -285,30 +141,21 @@ class ValueSearch(AbstractPointSearch):
         goes_on = scan.failed & (self.searches == 0)
         stage = jnp.where(goes_on, WIDE, self.stage).astype(self.stage.dtype)
         known = eqx.tree_at(lambda s: s.stage, known, stage)
-        anew = known._anew(params, scan.found, scan.nearest, jnp.ones_like(scan.fun))
+        anew = known.anew(params, scan.found, scan.nearest, jnp.ones_like(scan.fun))
         anew = dataclasses.replace(anew, evaluated=jnp.full_like(self.evaluated, -sizes.step))
         return where(scan.done(), anew, known)
-
-    def _checks(self) -> Bool[Array, ""]:
-        """Whether a point is evaluated again that was evaluated before."""
-        return (self.rounds == 0) & (self.taken == 0)
-
-    def _at_bottom(self, sizes: Sizes, width: Float[Array, ""]) -> Bool[Array, ""]:
-        """Whether the last evaluations, so far apart, say that nothing lower is near."""
-        funs, valid = self.history.funs[-sizes.first :], self.history.valid[-sizes.first :]
-        return rounding_alone(funs, valid, width)
 
     def _stepped(self, params: Params, sizes: Sizes) -> "ValueSearch":
         """The next center, from all samples."""
         history, average = self.history, self.average
         keyed, known = average is not None, (history.points, history.funs, history.valid)
-        returns = ~self._patient(self.searches) & ~self.noisy & (not keyed)
+        returns = ~self.patient(self.searches) & ~self.noisy & (not keyed)
         center, *_ = self.center.stepped(params, *known, True, returns, takes_key=keyed)
         # a metric can overflow where the function is flat
         finite = all_finite((center.theta, center.metric, center.trust.width))
         center = where(finite, center, self.center)
         stall = jnp.where(
-            self._at_bottom(sizes, self.center.trust.width), _ENOUGH, center.trust.stall
+            self.at_bottom(sizes, self.center.trust.width), _ENOUGH, center.trust.stall
         )
         center = eqx.tree_at(lambda c: c.trust.stall, center, stall)
         new = center, jnp.zeros_like(self.taken), self.rounds + 1
@@ -323,7 +170,7 @@ class ValueSearch(AbstractPointSearch):
         stuck = local & self.trust.stuck()
         # values with other keys are not to be compared, nor is how fast they fell
         compared = turn.over() & (self.average is None)
-        ended = (compared | stuck | (~local & self.center.lost(sizes))) & ~self._later()
+        ended = (compared | stuck | (~local & self.center.lost(sizes))) & ~self.later()
         # a model about to converge goes on, but not once it has: other searches may follow
         ended &= ~(local & (self.small > 0)) | self.converged()
 

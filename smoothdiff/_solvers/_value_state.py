@@ -1,0 +1,178 @@
+"""Where a search for the minimum of one number stands: how it begins, and how it ends."""
+
+import dataclasses
+from typing import Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from smoothdiff._params import Params
+from smoothdiff._solvers._history import History
+from smoothdiff._solvers._metric import Metric
+from smoothdiff._solvers._parameter_scan import Scan
+from smoothdiff._solvers._pilot import Pilot
+from smoothdiff._solvers._point_search import FIRST, SCAN, WIDE, AbstractPointSearch, Sizes
+from smoothdiff._solvers._quadratic_trust import QuadraticTrust
+from smoothdiff._solvers._ratio_test import is_narrow, rounding_alone
+from smoothdiff._solvers._regression_step import Center
+from smoothdiff._solvers._turns import Turn
+
+# of so many later searches one begins at the start
+_PATIENT = 4
+# the widths of later searches, in sigma, as powers of ten at random
+_NARROWEST, _WIDEST = -1.5, 0.3
+
+
+class ValueState(AbstractPointSearch):
+    """Where a search stands, with the local model and the center of the wide samples.
+
+    Those after the first, which `searches` counts, are the wide model's alone, in turns a patient
+    one at the start and some elsewhere. A `scan` of the parameters, one by one, if there is one, is
+    tried in a first search that is long, or else before the second; what that finds is searched
+    like the first. A patient search never goes back to the lowest sample: what is lowest by chance
+    does not lead it away from where the smoothed function is low. Nor does any search where the
+    function is `noisy`: where it gave another value for the same point, which the first round of
+    samples begins with. `idle` counts the evaluations that lowered its lowest value by no more than
+    rounding.
+    """
+
+    steps: Float[Array, " n"]
+    scan: Scan | None
+    searches: Int[Array, ""]
+    idle: Int[Array, ""]
+    noisy: Bool[Array, ""]
+    trust: QuadraticTrust
+    center: Center
+    taken: Int[Array, ""]
+    rounds: Int[Array, ""]
+    turn: Turn
+
+    @classmethod
+    def of(
+        cls,
+        params: Params,
+        theta: Float[Array, " n"],
+        sigma: Float[Array, " n"],
+        width: Array,
+        history: History,
+    ) -> Self:
+        """Nothing is known but what is in the history; the first samples are so wide."""
+        none, n = jnp.zeros((), jnp.int32), len(theta)
+        center = Center.start(theta, Metric.of(sigma, True))
+        center = eqx.tree_at(lambda c: c.trust.width, center, width)
+        never = jnp.zeros_like(width)
+        return cls(
+            stage=jnp.asarray(FIRST, jnp.int32),
+            history=history,
+            start=theta,
+            evaluated=none,
+            small=none,
+            stale=none,
+            pilot=Pilot.start(theta),
+            average=None,
+            steps=width * sigma,
+            scan=None,
+            searches=none,
+            idle=none,
+            noisy=jnp.asarray(False),
+            trust=QuadraticTrust.start(sigma, width),
+            center=center,
+            taken=none,
+            rounds=none,
+            turn=Turn.start(n, never),
+        )
+
+    def again(
+        self,
+        params: Params,
+        theta: Float[Array, " n"],
+        start: Float[Array, " n"],
+        lowest: tuple[Float[Array, " n"], Float[Array, ""]],
+        key: Array,
+    ) -> Self:
+        """Another search: in turns a patient one at the start, and some elsewhere of any width.
+
+        It begins with a scan of the parameters, if one is due.
+        """
+        empty = jax.tree.map(jnp.zeros_like, self.history)
+        searches = self.searches + 1
+        here = self.patient(searches)
+        power = jax.random.uniform(key, (), theta.dtype, _NARROWEST, _WIDEST)
+        theta, width = jnp.where(here, start, theta), jnp.where(here, 1, 10**power)
+        anew = self.of(params, theta, params.sigma, width, empty)
+        stage = jnp.full_like(self.stage, WIDE)
+        if self.scan is not None:
+            scan, scans = self.scan.next(params, *lowest)
+            anew = dataclasses.replace(anew, scan=scan)
+            stage = jnp.where(scans, SCAN, stage).astype(stage.dtype)
+        changed = stage, self.rounds + 1, searches, self.noisy
+        return eqx.tree_at(lambda s: (s.stage, s.rounds, s.searches, s.noisy), anew, changed)
+
+    def widened(self, params: Params, theta: Float[Array, " n"], width: Float[Array, ""]) -> Self:
+        """With all first points again."""
+        return self.anew(params, theta, params.sigma, width)
+
+    def anew(self, params: Params, theta: Array, sigma: Array, width: Array) -> Self:
+        """The same search from another point, with all that was evaluated."""
+        names = "pilot", "average", "searches", "rounds", "noisy", "scan"
+        anew = self.of(params, theta, sigma, width, self.history)
+        return dataclasses.replace(anew, **{name: getattr(self, name) for name in names})
+
+    def settled(self) -> Bool[Array, ""]:
+        """The local model's may be none."""
+        return ~self.is_local() | self.trust.settled
+
+    def checking(self) -> Bool[Array, ""]:
+        """The local model alone has checks."""
+        return self.is_local() & self.trust.check
+
+    def checked(self) -> Self:
+        """With a check as the local model's next point."""
+        return eqx.tree_at(lambda s: s.trust.check, self, self.is_local())
+
+    def right(self) -> Bool[Array, ""]:
+        """The local model alone has checks."""
+        return self.is_local() & self.trust.right
+
+    def lost(self, sizes: Sizes) -> Bool[Array, ""]:
+        """Whether neither model leads anywhere; after one converged the wide one may yet."""
+        narrow = is_narrow(self.center.trust.width) & ~self.noisy
+        lost = self.center.lost(sizes) | (narrow & (self.idle >= sizes.patience))
+        lost &= self.trust.failed() | self.later()
+        return lost if self.scan is None else lost | (self.scan.failed & (self.stage == SCAN))
+
+    def patient(self, searches: Int[Array, ""]) -> Bool[Array, ""]:
+        """Whether the search with this number is a patient one."""
+        return searches % _PATIENT == (1 if self.scan is None else 2)
+
+    def later(self) -> Bool[Array, ""]:
+        """Whether there are wide samples alone."""
+        scanned = jnp.asarray(False) if self.scan is None else self.scan.done()
+        return ((self.searches if self.average is None else self.rounds) > 0) & ~scanned
+
+    def width(self) -> Float[Array, ""]:
+        """The radius, or the width of the samples."""
+        return jnp.where(self.stage == WIDE, self.center.trust.width, self.trust.radius)
+
+    def candidates(self) -> list[Float[Array, " n"]]:
+        """With noise, the lowest point owes much to luck, and the center little."""
+        return [self.center.theta] if self.average is None else super().candidates()
+
+    def round(self) -> Int[Array, ""]:
+        """So many rounds of samples."""
+        return self.rounds
+
+    def smoothing(self) -> Float[Array, ""]:
+        """Half the trace of the model's Hessian."""
+        return jnp.trace(self.trust.hessian) * self.width() ** 2 / 2
+
+    def checks_noise(self) -> Bool[Array, ""]:
+        """Whether a point is evaluated again that was evaluated before."""
+        return (self.rounds == 0) & (self.taken == 0)
+
+    def at_bottom(self, sizes: Sizes, width: Float[Array, ""]) -> Bool[Array, ""]:
+        """Whether the last evaluations, so far apart, say that nothing lower is near."""
+        funs, valid = self.history.funs[-sizes.first :], self.history.valid[-sizes.first :]
+        return rounding_alone(funs, valid, width)
