@@ -99,7 +99,7 @@ class HostFunction:
                 samples, int(k) if i is None else i, "returned a value that is not finite"
             )
             if self.on_nonfinite == "raise":
-                raise BlackBoxError(f'{fault}\n(on_nonfinite="nan" makes it a NaN instead)')
+                raise _at_point(f'{fault}\n(on_nonfinite="nan" makes it a NaN instead)')
             _log.info("%s", fault)
             for row in rows:
                 row[k] = np.nan
@@ -174,7 +174,7 @@ class HostFunction:
     def _failure(self, samples: Samples, outcome: Outcome, error: BaseException) -> BlackBoxError:
         again = f" (tried {outcome.tries} times)" if outcome.tries > 1 else ""
         what = f"raised {type(error).__name__}: {error}{again}"
-        return BlackBoxError(f"{self._fault(samples, outcome.sample, what)}\n\n{_trace(error)}")
+        return _at_point(f"{self._fault(samples, outcome.sample, what)}\n\n{_trace(error)}")
 
     def _lost(self, samples: Samples, lost: PoolLostError) -> BlackBoxError:
         """No call can be made anymore; nobody knows which one brought that about."""
@@ -204,6 +204,12 @@ class HostFunction:
         with np.printoptions(threshold=20, edgeitems=3, precision=8):
             call = f"{self.name}({', '.join(map(repr, samples.arguments(i)))})"
         return call if len(call) <= 2000 else f"{call[:2000]} ..."
+
+
+def _at_point(text: str) -> BlackBoxError:
+    error = BlackBoxError(text)
+    error.at_point = True
+    return error
 
 
 def _rows(i: int | None) -> slice:

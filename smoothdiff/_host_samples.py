@@ -34,6 +34,9 @@ class BlackBoxError(RuntimeError):
     Source: own.
     """
 
+    # whether the function failed at its arguments, so that others may do
+    at_point = False
+
 
 def wait_for(leaves: Sequence[Any], name: str, seconds: float = 60.0) -> None:
     """Waits until JAX has handed over the arguments; raises where it seems that it never will.

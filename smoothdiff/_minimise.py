@@ -22,7 +22,7 @@ from smoothdiff._default_solver import default_solver
 from smoothdiff._host_samples import BlackBoxError
 from smoothdiff._host_steps import HostProblem
 from smoothdiff._limits import Limits
-from smoothdiff._result import MinimiseError, Record, Result
+from smoothdiff._result import Record, Result
 from smoothdiff._run import Problem, Run, inexact
 from smoothdiff._solvers import AbstractSmoothSolver
 from smoothdiff._solvers._base import write_options
@@ -285,7 +285,7 @@ def _run(
     except KeyboardInterrupt:
         return run.found("interrupted")
     except (BlackBoxError, jax.errors.JaxRuntimeError) as error:
-        raise MinimiseError(str(error), run.found("failed")) from (error.__cause__ or error)
+        raise run.failed(error) from (error.__cause__ or error)
     finally:
         run.save()
 

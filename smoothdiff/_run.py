@@ -36,6 +36,10 @@ _ADVICE = {
     "drop": 'Too few samples were finite for nonfinite="drop" to go on with the others: begin '
     "where fun is finite, take a smaller sigma, or set bounds within which it is",
 }
+_UNBOUNDED = (
+    "\nNothing bounds the search: bounds=(low, high), or a space, keeps it to points where fun can "
+    "be evaluated"
+)
 
 
 class Problem(eqx.Module):
@@ -237,6 +241,12 @@ class Run:
     def _nonfinite(self, progress: Progress | None = None) -> MinimiseError:
         advice = _ADVICE[getattr(self._ours(), "nonfinite", "propagate")]
         return MinimiseError(_NONFINITE + advice, self.found("nonfinite", progress))
+
+    def failed(self, error: Exception) -> MinimiseError:
+        """What to raise where a black box failed, as it may at points that nothing keeps out."""
+        anywhere = self.problem.options.get("bounds") is None
+        advice = _UNBOUNDED if anywhere and getattr(error, "at_point", False) else ""
+        return MinimiseError(str(error) + advice, self.found("failed"))
 
     def found(self, reason: str, progress: Progress | None = None) -> Result:
         """The result of a run that was cut short: no evaluation is made for it."""

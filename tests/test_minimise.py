@@ -304,6 +304,34 @@ def test_a_black_box_that_raises_loses_nothing(at, host, path):
     assert_same(run(checkpoint=path), whole)
 
 
+def radius(y):
+    """As in a drawing, there is none below zero."""
+    if y[0] < 0:
+        raise ValueError("negative radius")
+    return np.sum((y + 1) ** 2)
+
+
+def root(y):
+    with np.errstate(invalid="ignore"):
+        return np.sqrt(y[0]) + y[1] ** 2
+
+
+@pytest.mark.parametrize("where", [{}, {"bounds": (-1.0, 2.0)}, {"space": sd.Range(-1.0, 2.0)}])
+@pytest.mark.parametrize("fails", [radius, root])
+def test_a_point_where_a_black_box_fails_leads_to_bounds_if_there_are_none(fails, where):
+    box = sd.black_box(fails, jnp.float32(0))
+    with pytest.raises(sd.MinimiseError, match=r"\[-\d") as caught:
+        sd.minimise(lambda y, args: box(y), jnp.full(2, 0.1), key=KEY, max_evaluations=40, **where)
+    assert ("bounds=(low, high), or a space, keeps it" in str(caught.value)) == (not where)
+
+
+def test_a_mistake_in_a_black_box_is_not_put_down_to_bounds():
+    box = sd.black_box(lambda y: np.zeros(3), jnp.float32(0))
+    with pytest.raises(sd.MinimiseError, match="promises") as caught:
+        sd.minimise(lambda y, args: box(y), jnp.zeros(2), key=KEY)
+    assert "bounds" not in str(caught.value)
+
+
 def test_a_step_that_is_not_finite_raises_and_keeps_the_result(host):
     edge = jnp.asarray(0.3)
     solver = sd.FirstOrder(optax.adam(0.05), 0.2, num_samples=N, nonfinite="drop")
