@@ -5,6 +5,7 @@ and only for those stages that a run comes to.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -14,10 +15,10 @@ from jax.sharding import NamedSharding
 from jaxtyping import Array, Bool, Float, PyTree
 
 from smoothdiff._params import layout_of
-from smoothdiff._run import Problem
+from smoothdiff._run import Problem, Trial
 from smoothdiff._solvers._base import smoothed_params
 from smoothdiff._solvers._evaluator import Evaluator
-from smoothdiff._solvers._judgement import Values
+from smoothdiff._solvers._judgement import Values, differ
 from smoothdiff._solvers._point_by_point import PointState, PointStep
 from smoothdiff._solvers._point_search import AbstractPointSearch, Sizes
 from smoothdiff._solvers._random_numbers import in_round, takes_key
@@ -57,17 +58,39 @@ class HostProblem(Problem):
         rows = _rows(self._evaluator(args, y), points)
         return self.host.told(y, state, points, rows, proposal)
 
-    def judge(self, y: PyTree, state: PointState) -> tuple[PyTree, dict[str, Any]]:
-        """Decided on the host, so that nothing is compiled for it."""
+    def spare(self, y: PyTree, state: PointState) -> int:
+        """Of the evaluations for the judgement, those that a function without noise leaves."""
+        if takes_key(self.options):
+            return 0
+        return self.solver.final_evaluations(y) - 2 - len(state.search.candidates())
 
+    def trial(self, y: PyTree, state: PointState) -> Trial:
+        """The lowest point once more."""
+        point, fun = state.progress.lowest_y, state.progress.lowest_fun
+        points = jax.tree.map(lambda a: a[None], point)
+        again = self._values(y).at(points, jnp.asarray(0, jnp.int32))
+        return Trial(again, bool(~jnp.isfinite(fun) | differ(again[0], fun)))
+
+    def judge(
+        self, y: PyTree, state: PointState, trial: Trial | None = None
+    ) -> tuple[PyTree, dict[str, Any]]:
+        """Decided on the host, so that nothing is compiled for it."""
+        values, parts = self._values(y), self.host.parts(y, state)
+        if trial is None:
+            return parts.judge(values, _loop)
+        if trial.noisy:
+            return parts.judge(values._replace(at=partial(_known_last, values.at, trial)), _loop)
+        y, stats = parts.judge(values, _once)
+        return y, stats | {"evaluations": stats["evaluations"] + 1}
+
+    def _values(self, y: PyTree) -> Values:
         def at(points: PyTree[Array], number: Array) -> Array:
             args = in_round(self.args, self.options, number)
             evaluate = self._evaluator(args, y)
             vectors = jax.vmap(lambda y: evaluate.layout.vector(jax.tree.leaves(y)))(points)
             return evaluate.funs(rows_at(evaluate, vectors, self.host.sizes.step))
 
-        values = Values(at, takes_key(self.options))
-        return self.host.parts(y, state).judge(values, _loop)
+        return Values(at, takes_key(self.options))
 
     def _evaluator(self, args: PyTree, y: PyTree) -> Evaluator:
         solver = self.solver
@@ -222,3 +245,17 @@ def _loop(more: Callable, body: Callable, state: Any) -> Any:
     while more(state):
         state = body(state)
     return state
+
+
+def _once(more: Callable, body: Callable, state: Any) -> Any:
+    """The same where one round is enough."""
+    return body(state)
+
+
+def _known_last(at: Callable, trial: Trial, points: PyTree[Array], number: Array) -> Array:
+    """The values `at` these points; in the first round that of the last one is known."""
+    if number > 0:
+        return at(points, number)
+    rest = jax.tree.map(lambda a: a[:-1], points)
+    more = len(jax.tree.leaves(rest)[0]) > 0
+    return jnp.concatenate([*([at(rest, number)] if more else []), trial.fun])

@@ -84,8 +84,9 @@ def minimise(
             from y0 to look at first. A number or a pytree like the parameters.
         target: a value that is good enough: the run ends where one as low was seen.
         max_evaluations: the most evaluations of `fun`, never exceeded. Some are set aside to judge
-            the result under noise; without noise they may stay unused. If neither this nor
-            `max_steps` is given, the limit is 200 (n + 1) for `NewtonCG` and `GaussNewton` with
+            the result under noise. Where the function is called between steps, one tells whether it
+            has noise, and if not, steps take the others; else they may stay unused. If neither this
+            nor `max_steps` is given, the limit is 200 (n + 1) for `NewtonCG` and `GaussNewton` with
             n < 100 parameters, which mostly end before by themselves, and 256 steps for others.
         max_steps: steps after which to stop.
         max_seconds: seconds after which no further step begins.

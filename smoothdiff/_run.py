@@ -7,14 +7,14 @@ import os
 import time
 import warnings
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from smoothdiff._checkpoint import Checkpoint
 from smoothdiff._identity import listed
@@ -40,6 +40,13 @@ _UNBOUNDED = (
     "\nNothing bounds the search: bounds=(low, high), or a space, keeps it to points where fun can "
     "be evaluated"
 )
+
+
+class Trial(NamedTuple):
+    """The function at the lowest point once more, and whether it is another value."""
+
+    fun: Float[Array, " 1"]
+    noisy: bool
 
 
 class Problem(eqx.Module):
@@ -93,8 +100,19 @@ class Problem(eqx.Module):
 
     done = eqx.filter_jit(_done)
 
+    def spare(self, y: PyTree, state: Any) -> int:
+        """Evaluations that more steps can take if a trial shows no noise."""
+        return 0
+
+    def trial(self, y: PyTree, state: Any) -> Trial:
+        """Where there are some."""
+        raise NotImplementedError
+
     @eqx.filter_jit
-    def judge(self, y: PyTree, state: Any) -> tuple[PyTree, dict[str, Any]]:
+    def judge(
+        self, y: PyTree, state: Any, trial: Trial | None = None
+    ) -> tuple[PyTree, dict[str, Any]]:
+        """The answer and its statistics, with what a trial showed."""
         result = optx.RESULTS.successful
         y, _, stats = self.solver.postprocess(
             self._fn, y, None, self.args, self.options, state, frozenset(), result
@@ -116,16 +134,29 @@ class Run:
     file: Checkpoint | None = None
     save_due: float = 0.0
     stopped: Bool[Array, ""] | None = None
+    trial: Trial | None = None
 
     @property
     def steps(self) -> int:
         return int(self.state.progress.step)
 
     def reached(self, limits: Limits) -> str | None:
-        """Why the limits end the run here, if they do."""
+        """Why the limits end the run here, if they do.
+
+        Where the function has no noise, which an evaluation tells, less is set aside to judge.
+        """
         progress = self.state.progress
         seconds, lowest = time.monotonic() - self.start, progress.lowest_fun.item()
-        return limits.reached(self.steps, progress.evaluations.item(), seconds, lowest)
+        count = progress.evaluations.item()
+        reason = limits.reached(self.steps, count, seconds, lowest)
+        if reason != "max_evaluations":
+            return reason
+        fewer = count - self.problem.spare(self.y, self.state)
+        later = limits.reached(self.steps, fewer, seconds, lowest)
+        if later is None and self.trial is None:
+            with reraise():
+                self.trial = jax.block_until_ready(self.problem.trial(self.y, self.state))
+        return reason if self.trial is None or self.trial.noisy else later
 
     def attach(self, path: str | os.PathLike) -> None:
         """Keeps the run in a file from now on, and takes up the one that is already there."""
@@ -226,7 +257,8 @@ class Run:
     def judged(self, reason: str) -> Result:
         """The result of a run that ended well."""
         with reraise():
-            y, stats = jax.block_until_ready(self.problem.judge(self.y, self.state))
+            judged = self.problem.judge(self.y, self.state, self.trial)
+            y, stats = jax.block_until_ready(judged)
         # a last batch that fails costs no more than the smoothed value
         if not jnp.isfinite(stats["fun"]):
             raise self._nonfinite()

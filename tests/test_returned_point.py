@@ -175,6 +175,76 @@ def test_the_budget_is_not_exceeded(noise, run):
     assert result.evaluations == len(HOST.points) <= budget
 
 
+POINT_BY_POINT = ["newton", "restarts", "gauss-newton"]
+
+
+@pytest.mark.parametrize("solver", quick_of(POINT_BY_POINT, ["newton", "gauss-newton"]))
+@pytest.mark.parametrize("more", [0, 1, 4, 17])
+def test_without_noise_steps_take_what_the_judgement_does_not_need(solver, more):
+    run = Run(SETTINGS[solver]())
+    budget = 1 + run.solver.final_evaluations(LIKE) + more
+    result = run(tail, max_evaluations=budget)
+    assert result.reason == "max_evaluations"
+    assert_lowest(result)
+    assert result.evaluations == budget
+    # the lowest point again, twice, and the only candidate
+    assert result.history[-1].evaluations == budget - (2 if run.of_residuals else 3)
+    # the steps are those of a run with a larger budget
+    longer = run(tail, max_evaluations=budget + 9)
+    for record, same in zip(result.history, longer.history, strict=False):
+        np.testing.assert_array_equal(record.y, same.y)
+
+
+@pytest.mark.parametrize("solver", quick_of(POINT_BY_POINT, ["newton", "gauss-newton"]))
+def test_with_noise_the_judgement_takes_what_was_set_aside(solver):
+    run = Run(SETTINGS[solver]())
+    last = run.solver.final_evaluations(LIKE)
+    result = run(bowl, START, 0.1, max_evaluations=20 + last)
+    assert result.evaluations == len(HOST.points) == 20 + last
+    assert result.history[-1].evaluations == 20
+    fresh = zip(HOST.points[20:], HOST.values[20:], strict=True)
+    values = [value for point, value in fresh if np.array_equal(point, result.y)]
+    assert result.fun == pytest.approx(np.mean(values[:3]), rel=1e-5)
+
+
+def test_noise_that_is_seen_late_is_in_what_is_reported():
+    """It begins after the trial that shows none."""
+    solver = SETTINGS["gauss-newton"]()
+    budget = 20 + solver.final_evaluations(LIKE)
+
+    def stop(record):
+        HOST.noise = 0.1 if record.evaluations > 20 else 0.0
+
+    result = Run(solver)(bowl, START, max_evaluations=budget, callback=stop)
+    assert result.evaluations == len(HOST.points) == budget
+    assert result.fun == pytest.approx(HOST.values[-1], rel=1e-6)
+
+
+def test_samples_of_a_step_that_does_not_fit_cost_no_trial():
+    solver = sd.GaussNewton(0.3, num_samples=8)
+    result = Run(solver)(tail, max_evaluations=32 + solver.final_evaluations(LIKE))
+    assert result.evaluations == len(HOST.points) == 32 + 1
+
+
+def test_an_interruption_after_the_trial_changes_nothing(tmp_path):
+    run = Run(SETTINGS["newton"]())
+    budget = 20 + run.solver.final_evaluations(LIKE)
+    whole = run(tail, max_evaluations=budget)
+
+    def stop(record):
+        if record.evaluations == 23:
+            raise KeyboardInterrupt
+
+    path = tmp_path / "run"
+    assert run(tail, max_evaluations=budget, callback=stop, checkpoint=path).reason == "interrupted"
+    again = run(tail, max_evaluations=budget, checkpoint=path)
+    assert (again.evaluations, again.fun, len(again.history)) == (
+        whole.evaluations,
+        whole.fun,
+        len(whole.history),
+    )
+
+
 def test_without_noise_little_is_spent_on_the_judgement(run):
     """The lowest again, each candidate that was not evaluated yet, and a batch."""
     result = run(bowl)
