@@ -4,6 +4,7 @@ The parts know shapes only. So they are compiled once for all functions, keys, s
 and only for those stages that a run comes to.
 """
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -15,6 +16,7 @@ from jax.sharding import NamedSharding
 from jaxtyping import Array, Bool, Float, PyTree
 
 from smoothdiff._params import layout_of
+from smoothdiff._programs import QUICKLY, is_short
 from smoothdiff._run import Problem, Trial
 from smoothdiff._solvers._base import smoothed_params
 from smoothdiff._solvers._evaluator import Evaluator
@@ -32,6 +34,7 @@ class HostProblem(Problem):
     """A problem whose solver steps point by point."""
 
     host: "HostSteps"
+    quick: bool = eqx.field(static=True, default=False)
 
     @staticmethod
     def of(
@@ -47,6 +50,12 @@ class HostProblem(Problem):
         check(out)
         return self.host.init(y, out)
 
+    def ready(self, y: PyTree, state: PointState) -> "HostProblem":
+        """With how well the function is to be compiled."""
+        args = self.host.parts(y, state).numbers(self.args)
+        quick = is_quick(self._evaluator(args, y), y, self.host.sizes.step)
+        return dataclasses.replace(self, quick=quick)
+
     def stage(self, state: PointState) -> int:
         """That of the search."""
         return int(state.search.stage)
@@ -55,8 +64,12 @@ class HostProblem(Problem):
         """The next evaluations, between what is compiled for the stage of the search."""
         points, proposal = self.host.propose(y, state)
         args = self.host.parts(y, state).numbers(self.args)
-        rows = _rows(self._evaluator(args, y), points)
+        rows = rows_at(self._evaluator(args, y), points, len(points), self.quick)
         return self.host.told(y, state, points, rows, proposal)
+
+    def done(self, y: PyTree, state: PointState) -> Bool[Array, ""]:
+        """Whether the solver wants to stop before a step, compiled for shapes."""
+        return _done(self.host.parts(y, state))
 
     def spare(self, y: PyTree, state: PointState) -> int:
         """Of the evaluations for the judgement, those that a function without noise leaves."""
@@ -88,7 +101,8 @@ class HostProblem(Problem):
             args = in_round(self.args, self.options, number)
             evaluate = self._evaluator(args, y)
             vectors = jax.vmap(lambda y: evaluate.layout.vector(jax.tree.leaves(y)))(points)
-            return evaluate.funs(rows_at(evaluate, vectors, self.host.sizes.step))
+            rows = rows_at(evaluate, vectors, self.host.sizes.step, self.quick)
+            return evaluate.funs(rows)
 
         return Values(at, takes_key(self.options))
 
@@ -184,13 +198,23 @@ def evaluator(
     return Evaluator(_Function(fun), args, layout_of(y), squares, size, sharding)
 
 
-def rows_at(evaluate: Evaluator, points: Float[Array, "m n"], at_once: int) -> Float[Array, "m P"]:
-    """What the function returns at more points than those of a step.
+def is_quick(evaluate: Evaluator, y: PyTree[Array], at_once: int) -> bool:
+    """Whether the function at so many points is a program that is compiled quickly."""
 
-    As many at once as in a step, by the program that evaluated those.
-    """
-    parts = [points[i : i + at_once] for i in range(0, len(points), at_once)]
-    return jnp.concatenate([_rows(evaluate, part) for part in parts])
+    def rows(y: PyTree[Array]) -> Array:
+        points = jnp.stack(at_once * [evaluate.layout.vector(jax.tree.leaves(y))])
+        return evaluate(points)[0]
+
+    return is_short(rows, y)
+
+
+def rows_at(
+    evaluate: Evaluator, points: Float[Array, "m n"], at_once: int, quick: bool = False
+) -> Float[Array, "m P"]:
+    """What the function returns at points, so many at once: in a step, and by its program later."""
+    rows = _rows_quickly if quick else _rows
+    parts = [rows(evaluate, points[i : i + at_once]) for i in range(0, len(points), at_once)]
+    return parts[0] if len(parts) == 1 else jnp.concatenate(parts)
 
 
 @eqx.filter_jit
@@ -201,8 +225,8 @@ def _first_state(solver: Any, options: dict[str, Any], y: PyTree[Array], out: Py
 
 
 @eqx.filter_jit
-def _rows(evaluate: Evaluator, points: Float[Array, "K n"]) -> Float[Array, "K P"]:
-    return evaluate(points)[0]
+def _done(step: PointStep) -> Bool[Array, ""]:
+    return step.over()
 
 
 @eqx.filter_jit
@@ -225,13 +249,18 @@ def _counted(
 ) -> tuple[PyTree, PointState, Bool[Array, ""]]:
     """Also whether the solver wants to stop there."""
     y, state = step.counted(points, rows, after)
-    return y, state, step.solver.terminate(None, y, None, step.options, state, frozenset())[0]
+    return y, state, dataclasses.replace(step, y=y, state=state).over()
+
+
+def _rows_of(evaluate: Evaluator, points: Float[Array, "K n"]) -> Float[Array, "K P"]:
+    return evaluate(points)[0]
 
 
 _jit: Any = eqx.filter_jit
 _PARTS = _propose, _searched, _counted
 _WELL = [_jit(part) for part in _PARTS]
-_QUICKLY = [_jit(part, compiler_options={"xla_backend_optimization_level": 0}) for part in _PARTS]
+_QUICKLY = [_jit(part, compiler_options=QUICKLY) for part in _PARTS]
+_rows, _rows_quickly = _jit(_rows_of), _jit(_rows_of, compiler_options=QUICKLY)
 
 
 def _compiled(state: PointState) -> list[Callable]:

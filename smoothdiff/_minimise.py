@@ -264,6 +264,7 @@ def _run(
         else:
             problem = HostProblem.of(fun, solver, args, options, y)
         state = _first_state(problem, y, check)
+        problem = problem.ready(y, state)
     run = Run(problem, y, state, units, _keeps(loop.keep_iterates, y))
     try:
         if loop.checkpoint is not None:

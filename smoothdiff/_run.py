@@ -75,6 +75,10 @@ class Problem(eqx.Module):
         # weak types would compile the second step anew
         return jax.tree.map(lambda a: jnp.asarray(a, a.dtype), state)
 
+    def ready(self, y: PyTree, state: Any) -> "Problem":
+        """What the steps are taken with, once the function can be traced."""
+        return self
+
     def stage(self, state: Any) -> int:
         """Which of the steps comes next that are compiled each by itself."""
         return 0

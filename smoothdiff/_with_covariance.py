@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, PyTree
 
 from smoothdiff._covariance import Slopes, balance, slopes
-from smoothdiff._host_steps import evaluator, rows_at
+from smoothdiff._host_steps import evaluator, is_quick, rows_at
 from smoothdiff._parameter_errors import Answer
 from smoothdiff._params import layout_of
 from smoothdiff._reraise import reraise
@@ -92,7 +92,9 @@ def with_covariance(
     solver, y = result.solver, answer.y
     with reraise():
         evaluate = evaluator(unit_fun, True, args, y, solver.batch_size)
-        rows = rows_at(evaluate, jnp.asarray(points), solver.sizes(y).step)
+        at_once = solver.sizes(y).step
+        quick = is_quick(evaluate, y, at_once)
+        rows = rows_at(evaluate, jnp.asarray(points), at_once, quick)
         rows = jax.block_until_ready(rows)
     if rows.shape[1] != size:
         raise ValueError(f"fun returned {rows.shape[1]} residuals, and {size} in the run")

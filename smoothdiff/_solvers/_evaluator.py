@@ -43,7 +43,9 @@ class Evaluator(eqx.Module):
         if self.sharding is not None:
             rows, aux = jax.vmap(row)(shared_out(points, self.sharding))
             return columns_shared_out(rows, self.sharding), aux
-        return jax.lax.map(row, points, batch_size=self.batch_size or len(points))
+        if self.batch_size is None:
+            return jax.vmap(row)(points)
+        return jax.lax.map(row, points, batch_size=self.batch_size)
 
     def funs(self, rows: Float[Array, "m P"]) -> Float[Array, " m"]:
         """What is minimised, of each row."""

@@ -9,7 +9,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from smoothdiff._draws import Draws
 from smoothdiff._params import Params
@@ -202,6 +202,10 @@ class PointStep(eqx.Module):
         seen = Seen(params.layout.tree(point), fun)
         rest = progress.smoothed, progress.stderr, progress.sigma, count, progress.finite, seen
         return PointState(progress.after(self.y, *rest), search, state.restarts, state.aux)
+
+    def over(self) -> Bool[Array, ""]:
+        """Whether the solver wants to stop here."""
+        return self.solver.terminate(None, self.y, None, self.options, self.state, frozenset())[0]
 
     def _new(self, points: Float[Array, "K n"], rows: Float[Array, "K P"]) -> History:
         """These evaluations, of which those count that are finite."""

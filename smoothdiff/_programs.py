@@ -1,0 +1,35 @@
+"""Which programs are compiled quickly: those that run so short that compiling takes longer."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+from jax.extend.core import ClosedJaxpr, Jaxpr
+
+# half of the time of compiling is saved, and a program takes two to three times as long
+QUICKLY = {"xla_backend_optimization_level": 0}
+# a program that reads and writes fewer numbers takes less than a millisecond, host functions apart
+_SHORT = 100_000
+
+
+def is_short(fun: Callable[..., Any], *args: Any) -> bool:
+    """Whether the function is a short program on the CPU, which a loop never is."""
+    return jax.default_backend() == "cpu" and _numbers(jax.make_jaxpr(fun)(*args).jaxpr) < _SHORT
+
+
+def _numbers(jaxpr: Jaxpr) -> float:
+    """How many numbers its operations read and write, infinite with a loop."""
+    total = 0.0
+    for equation in jaxpr.eqns:
+        if equation.primitive.name in ("while", "scan"):
+            return math.inf
+        variables = *equation.invars, *equation.outvars
+        total += sum(math.prod(getattr(v.aval, "shape", ())) for v in variables)
+        parts = jax.tree.leaves(equation.params, is_leaf=lambda p: isinstance(p, _INNER))
+        inner = [p for p in parts if isinstance(p, _INNER)]
+        total += sum(_numbers(p.jaxpr if isinstance(p, ClosedJaxpr) else p) for p in inner)
+    return total
+
+
+_INNER = Jaxpr, ClosedJaxpr

@@ -1,0 +1,44 @@
+"""Which functions are compiled quickly: short programs, however long a host function takes."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import smoothdiff as sd
+from smoothdiff._programs import is_short
+
+pytestmark = pytest.mark.skipif(jax.default_backend() != "cpu", reason="a program of the CPU")
+BOX = sd.black_box(lambda y: y, jax.ShapeDtypeStruct((10,), jnp.float32))
+PICTURE = jnp.zeros((400, 400))
+
+
+@jax.jit
+def inside(y):
+    return jnp.sum(jnp.sin(PICTURE) * y[0])
+
+
+SHORT = {
+    "a sum": lambda y: jnp.sum(y**2),
+    "a host function": lambda y: jnp.sum(BOX(y) ** 2),
+    "a switch": lambda y: jax.lax.cond(y[0] > 0, jnp.sin, jnp.cos, y),
+}
+LONG = {
+    "a picture": lambda y: jnp.sum(jnp.sin(PICTURE) * y[0]),
+    "a picture in another program": inside,
+    "a picture in a branch": lambda y: jax.lax.cond(y[0] > 0, inside, jnp.sum, y),
+    "a large matrix": lambda y: PICTURE[:10].T @ y,
+    "many lines": lambda y: sum(jnp.sin(i * y) for i in range(5_000)),
+    "a loop": lambda y: jax.lax.fori_loop(0, 9, lambda i, y: y + 1, y),
+    "a loop that ends by itself": lambda y: jax.lax.while_loop(lambda y: y[0] < 9, jnp.exp, y),
+    "batches": lambda y: jax.lax.map(jnp.sin, y, batch_size=2),
+}
+
+
+@pytest.mark.parametrize("name", SHORT)
+def test_few_numbers_are_short(name):
+    assert is_short(SHORT[name], jnp.ones(10))
+
+
+@pytest.mark.parametrize("name", LONG)
+def test_many_numbers_and_loops_are_not(name):
+    assert not is_short(LONG[name], jnp.ones(10))
