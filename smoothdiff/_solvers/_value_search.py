@@ -118,7 +118,8 @@ class ValueSearch(ValueState):
             trust = self.trust.revise(proposal, before, new.funs, new.valid)
             slow = jnp.where(known.at_bottom(sizes, self.trust.radius), _ENOUGH, trust.slow)
             trust = eqx.tree_at(lambda t: t.slow, trust, slow)
-            return eqx.tree_at(lambda s: s.trust, known, trust)._turned(params, sizes)
+            changed = trust, known.history.best(self.start)[0]
+            return eqx.tree_at(lambda s: (s.trust, s.place), known, changed)._turned(params, sizes)
 
         def wide() -> "ValueSearch":
             taken = self.taken + sizes.step
@@ -175,7 +176,7 @@ class ValueSearch(ValueState):
         ended &= ~(local & (self.small > 0)) | self.converged()
 
         # what one has found the other begins with, unless it found little
-        revive = ~local & lower & self.trust.stuck()
+        revive = ~local & ((lower & self.trust.stuck()) | self._left(point))
         revived = self.trust.revived(self.center.trust.width)
         trust = where(revive, revived, self.trust)
         trust = where(local, trust, trust.retried())
@@ -189,6 +190,11 @@ class ValueSearch(ValueState):
         turned = eqx.tree_at(lambda s: (s.stage, s.trust, s.center, s.turn), self, new)
         after = where(ended, turned, self)
         return after if after.scan is None else after._tried(after.scan, params, point, fun)
+
+    def _left(self, point: Float[Array, " n"]) -> Bool[Array, ""]:
+        """Whether this point lies beyond the radius around where the local model was."""
+        length = jnp.linalg.norm(self.trust.metric.into(point - self.place))
+        return length > self.trust.radius
 
     def _tried(self, scan: Scan, params: Params, point: Array, fun: Array) -> "ValueSearch":
         """With the try of a scan next, if the first search is long and wide samples go on."""

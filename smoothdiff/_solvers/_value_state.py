@@ -28,8 +28,8 @@ _NARROWEST, _WIDEST = -1.5, 0.3
 class ValueState(AbstractPointSearch):
     """Where a search stands, with the local model and the center of the wide samples.
 
-    Those after the first, which `searches` counts, are the wide model's alone, in turns a patient
-    one at the start and some elsewhere. A `scan` of the parameters, one by one, if there is one, is
+    `place` is where the local model was. Searches after the first, which `searches` counts, are the
+    wide model's alone, in turns a patient one at the start and some elsewhere. A `scan` of the parameters, one by one, if there is one, is
     tried in a first search that is long, or else before the second; what that finds is searched
     like the first. A patient search never goes back to the lowest sample: what is lowest by chance
     does not lead it away from where the smoothed function is low. Nor does any search where the
@@ -44,6 +44,7 @@ class ValueState(AbstractPointSearch):
     idle: Int[Array, ""]
     noisy: Bool[Array, ""]
     trust: QuadraticTrust
+    place: Float[Array, " n"]
     center: Center
     taken: Int[Array, ""]
     rounds: Int[Array, ""]
@@ -78,6 +79,7 @@ class ValueState(AbstractPointSearch):
             idle=none,
             noisy=jnp.asarray(False),
             trust=QuadraticTrust.start(sigma, width),
+            place=theta,
             center=center,
             taken=none,
             rounds=none,
