@@ -29,13 +29,13 @@ class ValueState(AbstractPointSearch):
     """Where a search stands, with the local model and the center of the wide samples.
 
     `place` is where the local model was. Searches after the first, which `searches` counts, are the
-    wide model's alone, in turns a patient one at the start and some elsewhere. A `scan` of the parameters, one by one, if there is one, is
-    tried in a first search that is long, or else before the second; what that finds is searched
-    like the first. A patient search never goes back to the lowest sample: what is lowest by chance
-    does not lead it away from where the smoothed function is low. Nor does any search where the
-    function is `noisy`: where it gave another value for the same point, which the first round of
-    samples begins with. `idle` counts the evaluations that lowered its lowest value by no more than
-    rounding.
+    wide model's alone, in turns a patient one at the start and some elsewhere. A `scan` of the
+    parameters, one by one, if there is one, is tried in a first search that is long, or else before
+    the second; what that finds is searched like the first. A patient search never goes back to the
+    lowest sample: what is lowest by chance does not lead it away from where the smoothed function
+    is low. Nor does any search where the function is `noisy`: where it gave another value for the
+    same point, which the first round of samples begins with. `idle` counts the evaluations that
+    lowered its lowest value by no more than rounding.
     """
 
     steps: Float[Array, " n"]
