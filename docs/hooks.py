@@ -30,7 +30,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for name, readme in PAGES.items():
         text = (ROOT / name).read_text()
         # on the site pages lie beside these, not in docs/
-        text = text.replace("](../README.md)", f"]({readme})").replace("](docs/", "](")
+        text = text.replace("](../README.md)", f"]({readme})")
+        text = re.sub(r"\]\(((?:\.\./)*)docs/", r"](\1", text)
         files.append(made(config, name, text))
     for path in sorted(NOTEBOOKS.glob("*.ipynb")):
         for name, content in as_pages(path):

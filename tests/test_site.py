@@ -48,6 +48,10 @@ def test_pages_need_no_other_host(site):
         assert not [a for a in loaded.addresses if a.startswith(("http:", "https:", "//"))], page
 
 
+def test_no_page_is_there_twice(site):
+    assert not (site / "docs").exists()
+
+
 def test_all_equations_are_drawn(site):
     drawn = 0
     for page in site.rglob("*.html"):
