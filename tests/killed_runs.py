@@ -56,15 +56,24 @@ def called(host: Any, squares: bool, shape: tuple[int, ...]) -> Any:
 
 
 def run(name: str, folder: Path) -> None:
-    """Makes the run, or goes on with it, and writes down what it found."""
+    """Makes the run, or goes on with it; writes down how many steps it made, and what it found."""
     solver, y0, host, most = RUNS[name]
     squares = isinstance(solver, optx.AbstractLeastSquaresSolver)
     fun = called(host, squares, np.shape(host(y0)))
     bounds = (-1.0, 2.0) if solver.__class__ is not sd.ZeroGrads else None
     limits = {"max_evaluations": most, "bounds": bounds, "key": jax.random.key(0)}
+    made: list[int] = []
     (folder / "begun").touch()
     call = sd.least_squares if squares else sd.minimise
-    result = call(fun, jnp.asarray(y0), solver=solver, checkpoint=folder / "run.npz", **limits)
+    result = call(
+        fun,
+        jnp.asarray(y0),
+        solver=solver,
+        checkpoint=folder / "run.npz",
+        callback=lambda record: made.append(record.step),
+        **limits,
+    )
+    (folder / "made").write_text(str(len(made)))
     found = [np.asarray(result.fun), np.asarray(result.y), np.asarray(result.evaluations)]
     found += [np.asarray(record.y) for record in result.history]
     found += [np.asarray(record.fun) for record in result.history]

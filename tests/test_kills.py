@@ -41,6 +41,11 @@ def begin(context, name, folder):
     return process
 
 
+def steps_made(folder):
+    """By the last process that went on with the run."""
+    return int((folder / "made").read_text())
+
+
 @pytest.mark.parametrize("name", NAMES if KILLS else NAMES[:1])
 def test_a_run_that_was_killed_ends_with_the_same_bits(name, context, tmp_path):
     random = np.random.default_rng(NAMES.index(name))
@@ -53,23 +58,26 @@ def test_a_run_that_was_killed_ends_with_the_same_bits(name, context, tmp_path):
         whole, started = begin(context, name, folder), time.monotonic()
         whole.join()
         seconds = time.monotonic() - started
-    want = (folder / "found").read_bytes()
+    want, steps = (folder / "found").read_bytes(), steps_made(folder)
 
     kills = taken_up = 0
     folder = tmp_path / "killed"
     folder.mkdir()
     while True:
+        saved = (folder / "run.npz").exists()
         process = begin(context, name, folder)
         if kills < REAL:
             process.join(random.uniform(0.1, 0.9) * seconds)
             if process.is_alive():
                 process.kill()
-                kills, taken_up = kills + 1, taken_up + (folder / "run.npz").exists()
+                kills += 1
         process.join()
         if not (folder / "found").exists():
             assert process.exitcode == -9, process.exitcode
             continue
         assert (folder / "found").read_bytes() == want
+        assert (steps_made(folder) < steps) == saved  # not begun anew
+        taken_up += saved
         if kills >= REAL:
             break
         shutil.rmtree(folder)
@@ -102,8 +110,12 @@ def test_what_a_kill_would_leave_at_any_moment_is_taken_up_to_the_same_bits(name
     process.join()
     assert process.exitcode == 0
     assert any(kept)  # else this tells nothing
-    want = (tmp_path / "whole" / "found").read_bytes()
+    whole = tmp_path / "whole"
+    want = (whole / "found").read_bytes()
     for i, files in enumerate(kept):
-        assert (tmp_path / f"left{i}" / "found").read_bytes() == want
+        left = tmp_path / f"left{i}"
+        assert (left / "found").read_bytes() == want
         if name == "benchmarks":  # what was measured is not measured again
             assert all(path.read_bytes() == content for path, content in files.items())
+        else:  # not begun anew
+            assert (steps_made(left) < steps_made(whole)) == (left / "run.npz" in files)
