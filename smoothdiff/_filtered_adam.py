@@ -48,9 +48,8 @@ def filter_updates(filter: Filter) -> optax.GradientTransformationExtraArgs:
         >>> state = optimiser.init(image)
         >>> updates, state = optimiser.update(jnp.ones_like(image), state, image)
 
-    Source:
-        Chang et al. 2024, Spatiotemporal Bilateral Gradient Filtering for Inverse Rendering,
-        section 4.1.
+    Source: Chang et al. 2024, Spatiotemporal Bilateral Gradient Filtering for Inverse Rendering,
+    section 4.1.
     """
 
     def update(updates: Any, state: Any, params: Any = None, **extra_args: Any) -> tuple[Any, Any]:
@@ -69,10 +68,11 @@ def scale_by_filtered_adam(
 ) -> optax.GradientTransformationExtraArgs:
     r"""Adam's scaling with filters in space before and after its averages over time.
 
-    $$ g \leftarrow pre(g), \quad m \leftarrow \beta_1 m + (1 - \beta_1) g, \quad
+    $$ g \leftarrow \mathrm{pre}(g), \quad m \leftarrow \beta_1 m + (1 - \beta_1) g, \quad
        v \leftarrow \beta_2 v + (1 - \beta_2) g^2 $$
 
-    $$ update = \frac{post(m) / (1 - \beta_1^t)}{\sqrt{post(v) / (1 - \beta_2^t)} + \epsilon} $$
+    $$ \mathrm{update} = \frac{\mathrm{post}(m) / (1 - \beta_1^t)}
+        {\sqrt{\mathrm{post}(v) / (1 - \beta_2^t)} + \epsilon} $$
 
     The parameters guide both filters. Both moments get the same weights, so |post(m)| /
     sqrt(post(v)) is at most the largest |m| / sqrt(v): steps are as bounded as Adam's. Without
@@ -106,9 +106,8 @@ def scale_by_filtered_adam(
         >>> state = optimiser.init(roughness)
         >>> updates, state = optimiser.update(jnp.ones_like(roughness), state, roughness)
 
-    Source:
-        Chang et al. 2024, Spatiotemporal Bilateral Gradient Filtering for Inverse Rendering,
-        algorithms 2 and 3.
+    Source: Chang et al. 2024, Spatiotemporal Bilateral Gradient Filtering for Inverse Rendering,
+    algorithms 2 and 3.
     """
     for name, value in (("b1", b1), ("b2", b2)):
         if is_concrete(value) and not 0 <= value < 1:
@@ -195,9 +194,8 @@ def filtered_adam(
         >>> grads = {"texture": jnp.ones((8, 8, 3)), "light": jnp.ones(3)}
         >>> updates, state = optimiser.update(grads, state, params)
 
-    Source:
-        Chang et al. 2024, Spatiotemporal Bilateral Gradient Filtering for Inverse Rendering,
-        algorithm 2.
+    Source: Chang et al. 2024, Spatiotemporal Bilateral Gradient Filtering for Inverse Rendering,
+    algorithm 2.
     """
     return optax.chain(
         scale_by_filtered_adam(b1, b2, eps, prefilter, postfilter, second_moment),

@@ -31,13 +31,13 @@ def cross_bilateral(
 ) -> Filter:
     r"""A filter that smooths where the guide is smooth, and stops at the guide's edges.
 
-    It repeats, for levels $l = 0, 1, ...$ and taps $o \in \{-1, 0, 1\}^{ndim}$ in the grid,
+    It repeats, for levels $l = 0, 1, ...$ and taps $o \in \{-1, 0, 1\}^\mathrm{ndim}$ in the grid,
 
     $$ h(x) \leftarrow \frac{\sum_o w_o \, h(x + 2^l o)}{\sum_o w_o}, \quad
        w_o = e^{-\|o\| / \sigma_s} \, e^{-\|\theta(x + 2^l o) - \theta(x)\| / \sigma_d} $$
 
-    with the guide $\theta$ in all levels as it is given. The levels set the reach: $2^{levels} - 1$
-    pixels to each side.
+    with the guide $\theta$ in all levels as it is given. The levels set the reach:
+    $2^\mathrm{levels} - 1$ pixels to each side.
 
     Args:
         sigma_d: scale of differences of the guide, in its units, all channels together: 0 filters
@@ -67,9 +67,8 @@ def cross_bilateral(
         >>> [round(float(g)) for g in smooth]  # the edge is kept
         [2, 2, 2, 8, 8, 8]
 
-    Source:
-        Chang et al. 2024, Spatiotemporal Bilateral Gradient Filtering for Inverse Rendering, eq. 3
-        and 4; Dammertz et al. 2010 for the passes.
+    Source: Chang et al. 2024, Spatiotemporal Bilateral Gradient Filtering for Inverse Rendering,
+    eq. 3 and 4; Dammertz et al. 2010 for the passes.
     """
     _check_ndim(ndim)
     levels = operator.index(levels)
@@ -140,9 +139,8 @@ def bilateral(
         >>> [round(float(g), 2) for g in smooth]  # the step from 1 to 7 is kept
         [1.0, 1.06, 0.94, 7.01, 7.04, 6.97]
 
-    Source:
-        Chang et al. 2024, Spatiotemporal Bilateral Gradient Filtering for Inverse Rendering,
-        sections 4.1 and 5.1.1.
+    Source: Chang et al. 2024, Spatiotemporal Bilateral Gradient Filtering for Inverse Rendering,
+    sections 4.1 and 5.1.1.
     """
     cross = cross_bilateral(sigma_d, levels, ndim=ndim, sigma_s=sigma_s, log=log)
 
@@ -178,9 +176,8 @@ def laplacian(lam: Scale, *, ndim: int, power: int | float = 1) -> Filter:
         >>> [round(float(g), 2) for g in smooth]
         [0.09, 0.18, 0.45, 0.18, 0.09]
 
-    Source:
-        Chang et al. 2024, Spatiotemporal Bilateral Gradient Filtering for Inverse Rendering,
-        section 4.3; Osher et al. 2018, Laplacian smoothing gradient descent.
+    Source: Chang et al. 2024, Spatiotemporal Bilateral Gradient Filtering for Inverse Rendering,
+    section 4.3; Osher et al. 2018, Laplacian smoothing gradient descent.
     """
     _check_ndim(ndim)
     if is_concrete(lam) and not (lam >= 0 and np.isfinite(lam)):
