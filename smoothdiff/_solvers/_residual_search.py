@@ -178,7 +178,11 @@ class ResidualSearch(AbstractPointSearch):
             samples = samples[jnp.clip(at - 1, 0, len(samples) - 1)]
             points = jax.vmap(params.reflected)(wide.center[None] + width[None] * samples)
             step, worth = further(wide.move, width)
-            points = jnp.where(((at == 1) & worth)[:, None], (wide.center + step)[None], points)
+            # at the bounds it may be one that is known
+            end = params.clip(wide.center + step)
+            same = jnp.all(self.history.points == end[None], axis=1) & self.history.valid
+            worth &= ~jnp.any(same)
+            points = jnp.where(((at == 1) & worth)[:, None], end[None], points)
             return jnp.where((at == 0)[:, None], wide.center[None], points), nothing
 
         pilot = lambda: (self.pilot_points(params, draw, count), nothing)
