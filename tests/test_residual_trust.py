@@ -9,7 +9,7 @@ import scipy.optimize
 
 from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._evaluator import half_squares
-from smoothdiff._solvers._history import History
+from smoothdiff._solvers._history import History, alike
 from smoothdiff._solvers._residual_trust import Proposal, TrustRegion
 
 STEP = jax.jit(bounded_step)
@@ -176,9 +176,16 @@ def test_the_best_point_stays_in_the_history(x64):
     for i in range(40):
         point = jnp.full((1, 3), float(i))
         rows = jnp.full((1, 7), 1.0 + i)
-        room = history.keeping_best(1)
-        history = room.after(point, rows, half_squares(rows), jnp.ones(1, bool), jnp.asarray(1))
+        new = History(point, rows, half_squares(rows), jnp.ones(1, bool))
+        history = history.followed_by(new, keeps_best=True)
     point, row, _ = history.best(jnp.zeros(3))
     np.testing.assert_array_equal(point, best[0])
     np.testing.assert_array_equal(row, np.zeros(7))
     assert history.points[-1, 0] == 39
+
+
+def test_rows_are_alike_to_the_last_bit(dtype):
+    row = jnp.asarray(np.random.default_rng(0).normal(size=500), dtype)
+    nearly = row.at[7].set(jnp.nextafter(row[7], jnp.asarray(9, dtype)))
+    rows = jnp.stack([row, nearly, row, -row, jnp.full_like(row, jnp.inf)])
+    np.testing.assert_array_equal(alike(rows, row), [True, False, True, False, False])

@@ -20,7 +20,6 @@ from smoothdiff._solvers._base import (
     promotion,
     read_options,
     smoothed_params,
-    unless_failed,
 )
 from smoothdiff._solvers._evaluator import Evaluator, objectives
 from smoothdiff._solvers._history import History
@@ -162,7 +161,9 @@ class PointStep(eqx.Module):
         else:
             finite = after.enough(max(sizes.first, _ENOUGH))
         finite = (finite | search.is_trial()) & jnp.all(jnp.isfinite(theta))
-        new_y, after = unless_failed(finite, (new_y, after), (self.y, search))
+        # the history is no worse for a failed evaluation, and long: it is not chosen between
+        search = dataclasses.replace(search, history=after.history)
+        new_y, after = where(finite, (new_y, after), (self.y, search))
         unknown = jnp.asarray(jnp.nan, theta.dtype)
         seen = Seen(params.layout.tree(point), fun)
         progress = progress.after(

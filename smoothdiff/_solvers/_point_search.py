@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
 from smoothdiff._solvers._averaging import Average
-from smoothdiff._solvers._history import History
+from smoothdiff._solvers._history import History, alike
 from smoothdiff._solvers._pilot import PAIRS, Pilot
 
 # what is evaluated next: the first points, a step of the local model, samples around a center,
@@ -177,10 +177,8 @@ class AbstractPointSearch(eqx.Module):
 
     def kept(self, new: History) -> Any:
         """With these evaluations in the history instead of the oldest."""
-        count = len(new.funs)
         # what is lowest by luck stays no longer than others
-        room = self.history.keeping_best(count) if self.average is None else self.history
-        history = room.after(new.points, new.rows, new.funs, new.valid, jnp.asarray(count))
+        history = self.history.followed_by(new, keeps_best=self.average is None)
         return eqx.tree_at(lambda s: s.history, self, history)
 
     def enough(self, count: int) -> Bool[Array, ""]:
@@ -200,7 +198,7 @@ class AbstractPointSearch(eqx.Module):
     def piloting(self) -> Any:
         """With the pilot next, if the first points are over and all evaluations are the same."""
         rows, valid = self.history.rows, self.history.valid
-        same = jnp.all((rows == rows[jnp.argmax(valid)][None]) | ~valid[:, None])
+        same = jnp.all(alike(rows, rows[jnp.argmax(valid)]) | ~valid)
         stage = jnp.full_like(self.stage, PILOT)
         flat = eqx.tree_at(lambda s: (s.stage, s.pilot.follows), self, (stage, self.stage))
         return where(same & (self.stage != FIRST) & self.pilot.left(), flat, self)
@@ -215,7 +213,7 @@ class AbstractPointSearch(eqx.Module):
         """After these points of the pilot: the first points again, or what would have followed."""
         steps = (new.points - self.start[None]) / params.sigma[None]
         row = self.history.rows[jnp.argmax(self.history.valid)]
-        changed = jnp.any(new.rows != row[None], axis=1)
+        changed = ~alike(new.rows, row)
         pilot = self.pilot.after(steps, changed, new.valid)
         stage = jnp.where(pilot.left(), self.stage, pilot.follows)
         more = eqx.tree_at(lambda s: (s.stage, s.pilot), self, (stage, pilot))
@@ -240,8 +238,8 @@ class AbstractPointSearch(eqx.Module):
 
 
 def where(condition: Bool[Array, ""], a: Any, b: Any) -> Any:
-    """One of two pytrees."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), a, b)
+    """One of two pytrees; what is the same in both, such as the history, is not copied."""
+    return jax.tree.map(lambda a, b: a if a is b else jnp.where(condition, a, b), a, b)
 
 
 def by_stage(

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
 from smoothdiff._solvers._first_points import FirstPoints
-from smoothdiff._solvers._history import History
+from smoothdiff._solvers._history import History, alike
 from smoothdiff._solvers._pilot import Pilot
 from smoothdiff._solvers._point_search import (
     FIRST,
@@ -36,6 +36,8 @@ from smoothdiff._solvers._wide_rounds import Wide, further, sides_of
 _IDLE, _NARROWER = 6, 0.1
 # rounds that came to nothing are so much narrower when they are tried again
 _VAIN = 0.5
+# so much of the loss at the start is much, where a search should end
+_MUCH = 0.1
 # so many steps in a row that halve the loss, within the width, are trusted again
 _TRUE = 2
 
@@ -101,7 +103,8 @@ class ResidualSearch(AbstractPointSearch):
         """Before the minimum of a ripple is taken for the answer, wide rounds look around once."""
         after = super().counted(small, check, lower, least, count)
         unseen = (self.wide.rounds == 0) & self.is_local() & self.trust.of_ripple()
-        doubt = after.converged() & unseen & ~least
+        much = self.history.best(self.start)[2] > _MUCH * self.first.before
+        doubt = after.converged() & unseen & much & ~least
         around = after._to_wide(jnp.ones_like(self.wide.scale))
         around = eqx.tree_at(lambda s: s.small, around, jnp.zeros_like(self.small))
         return where(doubt, around, after)
@@ -223,7 +226,7 @@ class ResidualSearch(AbstractPointSearch):
         stage = jnp.where(first.done(), TRUST, FIRST).astype(self.stage.dtype)
         known = eqx.tree_at(lambda s: (s.stage, s.first), self, (stage, first))
         _, row, _ = self.history.best(self.start)
-        moved = jnp.any(self.history.rows != row[None], axis=1) & self.history.valid
+        moved = ~alike(self.history.rows, row) & self.history.valid
         few = 2 * (1 + jnp.sum(moved)) <= jnp.sum(self.history.valid)
         return where(first.done() & few, known._to_wide(jnp.ones_like(self.wide.scale)), known)
 

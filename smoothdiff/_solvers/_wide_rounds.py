@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float, Int
 from smoothdiff._params import Params
 from smoothdiff._solvers._averaging import apart
 from smoothdiff._solvers._base import dot
-from smoothdiff._solvers._history import History
+from smoothdiff._solvers._history import History, alike
 from smoothdiff._solvers._parameter_regression import gauss_newton_step
 from smoothdiff._solvers._residual_batch import centred
 
@@ -70,7 +70,7 @@ class Wide(eqx.Module):
         theta = params.clip(center + sigma * move)
         fresh = history.valid & (jnp.arange(len(u)) >= len(u) - count)
         some = history.rows[jnp.argmax(fresh)]
-        same = jnp.all(jnp.where(fresh[:, None], history.rows == some[None], True))
+        same = jnp.all(alike(history.rows, some) | ~fresh)
         # a few that are the same call for more of them first
         flat = same & ~self.seen
         scale = next_scale(self.scale, flat, history, here, u, error, longest / LONGEST)
@@ -134,7 +134,7 @@ def next_scale(
         length: Of the step.
     """
     # a plateau of the residuals around the iterate is seen whole or not at all
-    plateau = history.valid & jnp.all(history.rows == here[None], axis=1)
+    plateau = history.valid & alike(history.rows, here)
     extent = jnp.max(jnp.where(plateau, jnp.sqrt(jnp.mean(u**2, axis=1)), 0))
     wanted = jnp.maximum(2 * jnp.sqrt(jnp.mean(error**2)), length)
     wanted = jnp.clip(jnp.maximum(wanted, extent), _SHRINK, _GROW)

@@ -90,8 +90,8 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         rtol: relative tolerance. The run has converged when three steps in a row are below
             `atol + rtol * max(norm(y), norm(sigma))`, unless only the radius made them short, or
             they failed where the model promised more than rounding may take. Where no step as long
-            as a hundredth of sigma was predicted, that may be a ripple's minimum: wide rounds look
-            around first.
+            as a hundredth of sigma was predicted, and more than a tenth of the first loss is left,
+            that may be a ripple's minimum: wide rounds look around first.
         atol: absolute tolerance. With both zero no run converges; else the tolerance is at least
             the root of the rounding of `max(norm(y), norm(sigma))`.
         norm: the norm of steps and iterates.
