@@ -12,6 +12,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.extend.core import ClosedJaxpr
 from jax.sharding import NamedSharding
 from jaxtyping import Array, Bool, Float, PyTree
 
@@ -43,18 +44,12 @@ class HostProblem(Problem):
         """For parameters like `y`, once the values of the solver were looked at."""
         return HostProblem(fun, solver, args, options, HostSteps.of(solver, options, y))
 
-    def init(self, y: PyTree, check: Callable[[PyTree], None]) -> PointState:
-        """As for any problem, compiled for shapes."""
-        fn = _Function(self.fun)
-        out = jax.eval_shape(lambda y: fn(y, self.args)[0], y)
+    def begin(self, y: PyTree, check: Callable[[PyTree], None]) -> tuple["HostProblem", PointState]:
+        """As for any problem, compiled for shapes; and with how well to compile the function."""
+        program, out = traced(self.fun, y, self.args)
         check(out)
-        return self.host.init(y, out)
-
-    def ready(self, y: PyTree, state: PointState) -> "HostProblem":
-        """With how well the function is to be compiled."""
-        args = self.host.parts(y, state).numbers(self.args)
-        quick = is_quick(self._evaluator(args, y), y, self.host.sizes.step)
-        return dataclasses.replace(self, quick=quick)
+        quick = is_short(program, self.host.sizes.step)
+        return dataclasses.replace(self, quick=quick), self.host.init(y, out)
 
     def stage(self, state: PointState) -> int:
         """That of the search."""
@@ -198,14 +193,10 @@ def evaluator(
     return Evaluator(_Function(fun), args, layout_of(y), squares, size, sharding)
 
 
-def is_quick(evaluate: Evaluator, y: PyTree[Array], at_once: int) -> bool:
-    """Whether the function at so many points is a program that is compiled quickly."""
-
-    def rows(y: PyTree[Array]) -> Array:
-        points = jnp.stack(at_once * [evaluate.layout.vector(jax.tree.leaves(y))])
-        return evaluate(points)[0]
-
-    return is_short(rows, y)
+def traced(fun: Callable, y: PyTree[Array], args: PyTree) -> tuple[ClosedJaxpr, PyTree]:
+    """The function as a program at one point, and the structure of what it returns."""
+    fn = _Function(fun)
+    return jax.make_jaxpr(lambda y: fn(y, args)[0], return_shape=True)(y)
 
 
 def rows_at(

@@ -263,8 +263,7 @@ def _run(
             problem = Problem(fun, solver, args, options)
         else:
             problem = HostProblem.of(fun, solver, args, options, y)
-        state = _first_state(problem, y, check)
-        problem = problem.ready(y, state)
+        problem, state = _begun(problem, y, check)
     run = Run(problem, y, state, units, _keeps(loop.keep_iterates, y))
     try:
         if loop.checkpoint is not None:
@@ -297,12 +296,12 @@ def _keeps(asked: bool | None, y: PyTree[Array]) -> bool:
     return sum(leaf.size for leaf in jax.tree.leaves(y)) < _MANY if asked is None else asked
 
 
-def _first_state(problem: Problem, y: PyTree, check: Callable[[PyTree], None]) -> Any:
+def _begun(problem: Problem, y: PyTree, check: Callable[[PyTree], None]) -> tuple[Problem, Any]:
     """After an evaluation, which counts, if only that can tell what a black box returns."""
     try:
-        return problem.init(y, check)
+        return problem.begin(y, check)
     except UnknownOutputError:
         problem.fun(y, problem.args)
-    state = problem.init(y, check)
+    problem, state = problem.begin(y, check)
     count = state.progress.evaluations
-    return eqx.tree_at(lambda s: s.progress.evaluations, state, count + 1)
+    return problem, eqx.tree_at(lambda s: s.progress.evaluations, state, count + 1)

@@ -1,8 +1,6 @@
 """Which programs are compiled quickly: those that run so short that compiling takes longer."""
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import jax
 from jax.extend.core import ClosedJaxpr, Jaxpr
@@ -13,9 +11,9 @@ QUICKLY = {"xla_backend_optimization_level": 0}
 _SHORT = 100_000
 
 
-def is_short(fun: Callable[..., Any], *args: Any) -> bool:
-    """Whether the function is a short program on the CPU, which a loop never is."""
-    return jax.default_backend() == "cpu" and _numbers(jax.make_jaxpr(fun)(*args).jaxpr) < _SHORT
+def is_short(program: ClosedJaxpr, times: int = 1) -> bool:
+    """Whether a program is short on the CPU, so many times at once; with a loop it never is."""
+    return jax.default_backend() == "cpu" and times * _numbers(program.jaxpr) < _SHORT
 
 
 def _numbers(jaxpr: Jaxpr) -> float:

@@ -64,20 +64,17 @@ class Problem(eqx.Module):
     def value(self, y: PyTree) -> PyTree[Array]:
         return self._fn(y, self.args)[0]
 
-    def init(self, y: PyTree, check: Callable[[PyTree], None]) -> Any:
-        """The first state, if `check` accepts the structure of what the function returns.
+    def begin(self, y: PyTree, check: Callable[[PyTree], None]) -> tuple["Problem", Any]:
+        """What the steps are taken with, and the first state.
 
-        Not compiled, so that the solver can look at values and refuse them.
+        If `check` accepts the structure of what the function returns. Not compiled, so that the
+        solver can look at values and refuse them.
         """
         out = jax.eval_shape(lambda y: self.value(y), y)
         check(out)
         state = self.solver.init(self._fn, y, self.args, self.options, out, None, frozenset())
         # weak types would compile the second step anew
-        return jax.tree.map(lambda a: jnp.asarray(a, a.dtype), state)
-
-    def ready(self, y: PyTree, state: Any) -> "Problem":
-        """What the steps are taken with, once the function can be traced."""
-        return self
+        return self, jax.tree.map(lambda a: jnp.asarray(a, a.dtype), state)
 
     def stage(self, state: Any) -> int:
         """Which of the steps comes next that are compiled each by itself."""

@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Float, PyTree
 
 from smoothdiff._covariance import Slopes, balance, slopes
-from smoothdiff._host_steps import evaluator, is_quick, rows_at
+from smoothdiff._host_steps import evaluator, rows_at, traced
 from smoothdiff._parameter_errors import Answer
 from smoothdiff._params import layout_of
+from smoothdiff._programs import is_short
 from smoothdiff._reraise import reraise
 from smoothdiff._result import NO_COVARIANCE, Result, kept_residuals
 from smoothdiff._solvers._random_numbers import keyed
@@ -93,7 +94,7 @@ def with_covariance(
     with reraise():
         evaluate = evaluator(unit_fun, True, args, y, solver.batch_size)
         at_once = solver.sizes(y).step
-        quick = is_quick(evaluate, y, at_once)
+        quick = is_short(traced(unit_fun, y, args)[0], at_once)
         rows = rows_at(evaluate, jnp.asarray(points), at_once, quick)
         rows = jax.block_until_ready(rows)
     if rows.shape[1] != size:

@@ -57,6 +57,8 @@ def executor_of(way):
             distributed.Client(cluster) as client,
         ):
             yield client
+            # a worker that is just being replaced cannot be closed
+            client.wait_for_workers(2, timeout=60)
     else:
         yield None
 

@@ -1,7 +1,6 @@
 """Where a search for the minimum of one number stands: how it begins, and how it ends."""
 
 import dataclasses
-from typing import Self
 
 import equinox as eqx
 import jax
@@ -58,7 +57,7 @@ class ValueState(AbstractPointSearch):
         sigma: Float[Array, " n"],
         width: Array,
         history: History,
-    ) -> Self:
+    ) -> "ValueState":
         """Nothing is known but what is in the history; the first samples are so wide."""
         none, n = jnp.zeros((), jnp.int32), len(theta)
         center = Center.start(theta, Metric.of(sigma, True))
@@ -93,7 +92,7 @@ class ValueState(AbstractPointSearch):
         start: Float[Array, " n"],
         lowest: tuple[Float[Array, " n"], Float[Array, ""]],
         key: Array,
-    ) -> Self:
+    ) -> "ValueState":
         """Another search: in turns a patient one at the start, and some elsewhere of any width.
 
         It begins with a scan of the parameters, if one is due.
@@ -112,11 +111,13 @@ class ValueState(AbstractPointSearch):
         changed = stage, self.rounds + 1, searches, self.noisy
         return eqx.tree_at(lambda s: (s.stage, s.rounds, s.searches, s.noisy), anew, changed)
 
-    def widened(self, params: Params, theta: Float[Array, " n"], width: Float[Array, ""]) -> Self:
+    def widened(
+        self, params: Params, theta: Float[Array, " n"], width: Float[Array, ""]
+    ) -> "ValueState":
         """With all first points again."""
         return self.anew(params, theta, params.sigma, width)
 
-    def anew(self, params: Params, theta: Array, sigma: Array, width: Array) -> Self:
+    def anew(self, params: Params, theta: Array, sigma: Array, width: Array) -> "ValueState":
         """The same search from another point, with all that was evaluated."""
         names = "pilot", "average", "searches", "rounds", "noisy", "scan"
         anew = self.of(params, theta, sigma, width, self.history)
@@ -130,7 +131,7 @@ class ValueState(AbstractPointSearch):
         """The local model alone has checks."""
         return self.is_local() & self.trust.check
 
-    def checked(self) -> Self:
+    def checked(self) -> "ValueState":
         """With a check as the local model's next point."""
         return eqx.tree_at(lambda s: s.trust.check, self, self.is_local())
 
