@@ -69,6 +69,10 @@ def test_rounding_alone_is_more_values_than_levels(dtype):
     assert not said(levels, 0.1)
     # a slope has as many levels as values
     assert not said(3 + 4 * eps * np.array([0, 9, 17, 40, 28]), 1e-6)
+    # evaluations that failed say nothing
+    for left in range(2):
+        some = jnp.arange(5) < left
+        assert not rounding_alone(jnp.asarray(levels, dtype), some, jnp.asarray(1e-6))
     # stairs of a hundredth are no rounding
     assert not said([3.0, 3.0, 3.01, 3.01, 3.0], 1e-6)
 

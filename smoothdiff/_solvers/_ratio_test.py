@@ -103,7 +103,9 @@ def rounding_alone(
     unit = jnp.min(jnp.where((gaps > 0) & jnp.isfinite(gaps), gaps, jnp.inf))
     highest = jnp.max(jnp.where(valid, funs, -jnp.inf))
     spread = highest - levels[0]
-    few = spread < (jnp.sum(valid) - 1).astype(unit.dtype) * unit
+    count = jnp.sum(valid)
+    # of one value, or none, nothing is known
+    few = (count > 1) & (spread < (count - 1).astype(unit.dtype) * unit)
     little = spread <= taken_by_rounding(highest)
     return few & little & is_narrow(width)
 
