@@ -67,8 +67,8 @@ class Problem(eqx.Module):
     def begin(self, y: PyTree, check: Callable[[PyTree], None]) -> tuple["Problem", Any]:
         """What the steps are taken with, and the first state.
 
-        If `check` accepts the structure of what the function returns. Not compiled, so that the
-        solver can look at values and refuse them.
+        `check` raises for a structure of what the function returns that is refused. Nothing is
+        compiled, so that the solver can look at values and refuse them too.
         """
         out = jax.eval_shape(lambda y: self.value(y), y)
         check(out)
