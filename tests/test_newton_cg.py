@@ -99,7 +99,12 @@ def watched(y, target):
     return jnp.sum((y - target) ** 2)
 
 
-PLANE = [quadratic, rosenbrock, plateaus, saddle, well, two_wells, constant, ellipse]
+def stairs(y, target):
+    """The lowest has a radius of 1; it is watched too."""
+    return jnp.floor(watched(y, target))
+
+
+PLANE = [quadratic, rosenbrock, plateaus, saddle, well, two_wells, constant, ellipse, stairs]
 PLANE += [noisy, noisier, abyss, sieve, watched]
 
 
@@ -189,6 +194,17 @@ def test_plateaus_are_crossed_to_the_lowest(seeds, dtype):
     away = [distance(runs(seed=seed, max_evaluations=300).y, (1.0, 0.6)) for seed in seeds]
     # the lowest plateau reaches 1/8 to each side
     assert np.max(away) < 0.125
+
+
+@few_seeds
+def test_samples_widen_to_the_middle_of_a_plateau(seeds, dtype):
+    """One of radius 1, twenty times as wide as sigma; its edge alone says where the middle is."""
+    run = functools.partial(solve, stairs, (2.2, 1.3), sigma=0.05, dtype=dtype)
+    nearest = []
+    for seed in seeds:
+        run(seed=seed, max_evaluations=150)
+        nearest.append(np.min(np.linalg.norm(np.reshape(EVALUATED, (-1, 2)), axis=1)))
+    assert np.median(nearest) < 0.2
 
 
 @few_seeds

@@ -26,6 +26,7 @@ from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import judged, judging, one_by_one
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._random_numbers import in_step
+from smoothdiff._solvers._ratio_test import are_level
 from smoothdiff._solvers._regression_step import Center
 from smoothdiff._solvers._restarts import Restarts
 from smoothdiff._stderr import value_stderr
@@ -140,6 +141,7 @@ def step(
         history.valid,
         adaptive,
         returns=jnp.asarray(False),
+        level=are_level(values, good),
         small=small,
     )
     new_y = params.layout.tree(after.theta)

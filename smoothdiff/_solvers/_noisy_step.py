@@ -145,14 +145,17 @@ def revise(
     ratio: Float[Array, ""],
     value: Float[Array, ""],
     small: Bool[Array, ""],
+    level: Bool[Array, ""],
     adaptive: bool,
 ) -> Trust:
     """The trust for the next step; the width stays as it is unless it is adaptive.
 
     The width goes to the length of the Newton step, or to its noise if that is more: where samples
-    are too few to tell, narrower ones would tell even less. Where all is noise it grows, and where
-    the function is constant it grows beyond sigma. A step has led somewhere if the `value` where it
-    started is the lowest so far, unless the next one is insignificant or `small`.
+    are too few to tell, narrower ones would tell even less. Where all is noise it grows. Where the
+    function is constant, or the last samples are all `level`, it grows beyond sigma: they are
+    narrower than what there is to see, as on the lowest of some stairs. A step has led somewhere if
+    the `value` where it started is the lowest so far, unless the next one is insignificant or
+    `small`.
     """
     most = math.sqrt(step.p.size)
     length = jnp.linalg.norm(step.p)
@@ -166,7 +169,7 @@ def revise(
         factor = jnp.where(length >= _EDGE * most, 1.5, factor)
         factor = jnp.where(step.insignificant, jnp.clip(need, 0.5, 1.2), factor)
         factor = jnp.minimum(factor, jnp.maximum(1 / width, 1))
-        factor = jnp.where(step.constant, 2, factor)
+        factor = jnp.where(step.constant | level, 2, factor)
     # the radius is in widths, and the region shall not shrink only because the width does
     radius = jnp.maximum(radius * change, _LEAST * most) / jnp.minimum(factor, 1)
     return Trust(

@@ -81,6 +81,12 @@ def is_lower(fun: Float[Array, ""], before: Float[Array, ""]) -> Bool[Array, ""]
     return before - fun > _NOTHING * jnp.finfo(fun.dtype).eps * jnp.abs(before)
 
 
+def are_level(funs: Float[Array, " K"], valid: Bool[Array, " K"]) -> Bool[Array, ""]:
+    """Whether these values are all the same, to the last bit."""
+    lowest = jnp.min(jnp.where(valid, funs, jnp.inf))
+    return (jnp.sum(valid) > 1) & jnp.all(~valid | (funs == lowest))
+
+
 def is_narrow(width: Float[Array, ""]) -> Bool[Array, ""]:
     """Whether points so many sigmas apart are near each other."""
     return width < _NARROW

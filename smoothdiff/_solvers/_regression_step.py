@@ -62,12 +62,14 @@ class Center(eqx.Module):
         valid: Bool[Array, " m"],
         adaptive: bool,
         returns: Bool[Array, ""],
+        level: Bool[Array, ""],
         small: Callable[[Array], Array] = lambda move: jnp.asarray(False),
         takes_key: bool = False,
     ) -> tuple["Center", Float[Array, ""], Float[Array, ""]]:
         """The next center; the smoothed function at this one, and its standard error.
 
-        It `returns` to the lowest sample from a step that led nowhere, or not.
+        It `returns` to the lowest sample from a step that led nowhere, or not. The last samples may
+        be all `level`.
         `small` says whether a step is too small to lead anywhere. Where the function
         `takes_key`, samples are no nearer to each other than noise allows.
         """
@@ -98,7 +100,7 @@ class Center(eqx.Module):
         lowest = jnp.argmin(known)
         # an estimate below all samples is an error of the model
         value = jnp.maximum(model.value(here), known[lowest])
-        new = revise(trust, step, good, ratio, value, small(x - base), adaptive)
+        new = revise(trust, step, good, ratio, value, small(x - base), level, adaptive)
         if takes_key:
             wide = jnp.maximum(new.width, apart(trust.width, model.noise, model.spread(here)))
             radius = new.radius * new.width / wide

@@ -29,7 +29,7 @@ from smoothdiff._solvers._point_search import (
     where,
 )
 from smoothdiff._solvers._quadratic_trust import Proposal
-from smoothdiff._solvers._ratio_test import is_lower
+from smoothdiff._solvers._ratio_test import are_level, is_lower
 from smoothdiff._solvers._turns import Turn
 from smoothdiff._solvers._value_state import ValueState
 
@@ -151,7 +151,9 @@ class ValueSearch(ValueState):
         history, average = self.history, self.average
         keyed, known = average is not None, (history.points, history.funs, history.valid)
         returns = ~self.patient(self.searches) & ~self.noisy & (not keyed)
-        center, *_ = self.center.stepped(params, *known, True, returns, takes_key=keyed)
+        last = history.funs[-sizes.first :], history.valid[-sizes.first :]
+        level = are_level(*last)
+        center, *_ = self.center.stepped(params, *known, True, returns, level, takes_key=keyed)
         # a metric can overflow where the function is flat
         finite = all_finite((center.theta, center.metric, center.trust.width))
         center = where(finite, center, self.center)

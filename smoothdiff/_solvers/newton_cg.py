@@ -50,7 +50,8 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
       known of the noise decides how far to go: entries of the gradient are shrunk by their standard
       errors, and the test of the last step is relaxed by that of the difference. Samples count less
       the higher they are. The width shrinks to the length of the step as far as noise allows, and
-      grows on a plateau. After six rounds that lead nowhere the center goes back to the best point.
+      grows where a round of samples has one value alone, as on a plateau. After six rounds that
+      lead nowhere the center goes back to the best point.
 
     M, the metric of both, takes the shape of the Hessian, directions included up to 64 parameters.
     So sigma says where to begin.
