@@ -63,7 +63,7 @@ class Counter:
         """The problem as the methods see it: whatever evaluates it is counted."""
         seen: dict[str, Any] = {
             name: self.watch(fun)
-            for name in ("loss", "residuals", "terms")
+            for name in ("loss", "residuals", "keyed", "terms")
             if (fun := getattr(problem, name)) is not None
         }
         if (grey := problem.grey) is not None:
@@ -74,10 +74,10 @@ class Counter:
         return dataclasses.replace(problem, **seen)
 
     def watch(self, fun: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
-        """The same function of y, counted: one for each y, whatever the size of the value."""
+        """The same function, counted: one for each y, whatever the size of the value."""
 
-        def counted(*y: Y) -> jax.Array:
-            value = fun(*y)
+        def counted(*y_and_key: Any) -> jax.Array:
+            value = fun(*y_and_key)
             flat = value.ravel()
             out = jax.ShapeDtypeStruct((), value.dtype)
             first = jax.pure_callback(self._let_pass, out, flat[0], vmap_method="expand_dims")

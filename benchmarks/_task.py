@@ -87,6 +87,8 @@ class Problem:
             residuals, or the grey box's.
         residuals: y -> array, such that the loss is the sum or the mean of its squares, or None: a
             picture minus its reference, say. A call is counted like a call of the loss.
+        keyed: (y, key) -> the residuals with the noise of that key, or None where they have none.
+            The loss and the residuals have the same noise at every call.
         terms: y -> array, such that the loss is the sum of its entries, with `support`; or None. A
             call is counted likewise. By default from the residuals.
         support: Which of the terms a parameter may influence, as for `smoothdiff.smooth`. Then the
@@ -106,6 +108,7 @@ class Problem:
     budget: Budget
     loss: Loss = None  # type: ignore[assignment]
     residuals: Callable[[Y], jax.Array] | None = None
+    keyed: Callable[[Y, Key], jax.Array] | None = None
     terms: Callable[[Y], jax.Array] | None = None
     support: Any = None
     grey: Grey | None = None

@@ -44,6 +44,8 @@ SLOW = {
     "optimistix_bfgs": (200, 1e-6, 4 + 1 + 4),
     "jaxopt_lbfgs": (1600, 1e-2, None),
     "shortest_call": (60, 1e-6, 1),
+    "shortest_call_keys": (60, 1e-2, 1),
+    "fr22_keys": (600, 1e-2, 2),
     "dfo_ls": (60, 1e-6, 1),
     "dfo_ls_noise": (60, 1e-6, 1),
     "least_squares": (60, 1e-6, 1),
@@ -84,7 +86,10 @@ def tree(a, b):
 
 
 def bowl(evaluations: int = 1000) -> tuple[Problem, list[np.ndarray]]:
-    """A quadratic on the host as a function of a pytree, and the points that it has seen."""
+    """A quadratic on the host as a function of a pytree, and the points that it has seen.
+
+    With a key it has noise.
+    """
     seen = []
     root = np.linalg.cholesky(MATRIX).T
 
@@ -107,6 +112,7 @@ def bowl(evaluations: int = 1000) -> tuple[Problem, list[np.ndarray]]:
         sigma=0.5,
         budget=Budget(evaluations, 600),
         residuals=residuals,
+        keyed=lambda y, key: residuals(y) + 0.05 * jax.random.normal(key, (2,)),
         native_ad=lambda: native,
     ), seen
 

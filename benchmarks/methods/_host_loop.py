@@ -11,11 +11,13 @@ from benchmarks._task import Problem, Solve, Y
 from smoothdiff import Record
 
 
-def run_by(minimise: Callable, problem: Problem, fun: Callable[[Y], Any], solver: Any) -> Solve:
-    """The solver on a function of y, compiled once for all starts."""
+def run_by(
+    minimise: Callable, problem: Problem, fun: Callable[..., Any], solver: Any, **options: Any
+) -> Solve:
+    """The solver on a function of y, and of a key if the options say so; compiled once."""
 
-    def with_args(y, args):
-        return fun(y)
+    def with_args(y, args, *key):
+        return fun(y, *key)
 
     def solve(y0, key, record):
         best = _Best(y0)
@@ -27,6 +29,7 @@ def run_by(minimise: Callable, problem: Problem, fun: Callable[[Y], Any], solver
             max_evaluations=problem.budget.evaluations,
             bounds=problem.bounds,
             callback=lambda step: record(best.after(step)),
+            **options,
         )
         if result.reason == "interrupted":
             raise KeyboardInterrupt

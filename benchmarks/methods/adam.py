@@ -112,6 +112,15 @@ def fr22(problem: Problem, **settings: Any) -> Solve:
     return run_by(sd.minimise, problem, problem.loss, fr22_solver(problem, **settings))
 
 
+def fr22_with_keys(problem: Problem) -> Solve:
+    """Likewise, of a function that takes a key: the noise is another at each step."""
+    keyed = problem.keyed
+    if keyed is None:
+        raise NotAble("needs residuals whose noise follows from a key")
+    loss = lambda y, key: jnp.mean(keyed(y, key) ** 2)
+    return run_by(sd.minimise, problem, loss, fr22_solver(problem), takes_key=True)
+
+
 def optax_perturbations(
     problem: Problem, *, rate: float = LEARNING_RATE, num_samples: int = NUM_SAMPLES
 ) -> Solve:
@@ -138,6 +147,7 @@ METHODS = {
         {"rate": RATES, "step": (0.1, 0.3, 0.9)},
     ),
     "mitsuba_ad": MethodEntry("Mitsuba AD, Adam", ("scene",), native, {"rate": RATES}),
+    "fr22_keys": MethodEntry("FR22, fresh noise", ("scene",), fr22_with_keys),
     "fr22": MethodEntry(
         "Smoothed gradient, Adam (FR22)",
         ("scene", "large", "program", "function"),

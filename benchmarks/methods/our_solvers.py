@@ -66,8 +66,18 @@ def shortest(problem: Problem) -> Solve:
     return run_by(sd.least_squares, problem, problem.residuals, None)
 
 
+def shortest_with_keys(problem: Problem) -> Solve:
+    """Likewise, of a function that takes a key: the noise is another at each step."""
+    if problem.keyed is None:
+        raise NotAble("needs residuals whose noise follows from a key")
+    return run_by(sd.least_squares, problem, problem.keyed, None, takes_key=True)
+
+
 METHODS = {
     "shortest_call": MethodEntry("The shortest call (ours)", (), shortest),
+    "shortest_call_keys": MethodEntry(
+        "The shortest call, fresh noise (ours)", ("scene",), shortest_with_keys
+    ),
     "first_order": MethodEntry("First order (ours)", ("scene", "large", "program"), first_order),
     "newton_cg": MethodEntry("Newton-CG (ours)", ("scene", "program", "function"), newton_cg),
     "gauss_newton": MethodEntry(

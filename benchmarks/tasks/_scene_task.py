@@ -92,6 +92,7 @@ def scene_task(
             sigma=sigma,
             budget=budget,
             residuals=lambda y: render(y) - photo,
+            keyed=lambda y, key: render(y, key) - photo,
             support=support,
             native_ad=native_ad if ad_integrator else None,
         ),
