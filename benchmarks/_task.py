@@ -182,6 +182,9 @@ class Task:
             where it is the same for all seeds.
         dearer: The picture by dearer renders, by the name of the saving that each does without; ""
             is the render as it is. Or None. Made when they are asked for, and not counted.
+        fidelities: The render as a user might set it, of so many pixels along a side and so many
+            samples of each, and cheaper ones, (pixels, samples) -> levels from the cheapest; or
+            None. Made when they are asked for, and not counted.
         notes: Facts that belong beside the results, resolution and variant, say.
     """
 
@@ -194,6 +197,7 @@ class Task:
     precision: Literal["float32", "float64"] = "float32"
     choose: Callable[[int], Y] | None = None
     dearer: Callable[[], dict[str, Callable[[Y], jax.Array]]] | None = None
+    fidelities: Callable[[int, int], list[Any]] | None = None
     notes: str = ""
 
     @property

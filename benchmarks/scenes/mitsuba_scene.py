@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from benchmarks.scenes.meshes import Faces, Positions
+from smoothdiff import Level
 
 # the same pictures on every machine; with so few pixels it is as fast as any other variant
 VARIANT = "scalar_rgb"
@@ -38,6 +39,7 @@ SAVINGS = {
     "updates": "the scene built anew",
     "all": "without all four",
 }
+SHARP = 4  # times the samples of a picture, for its photograph
 LONG_PATHS = {"type": "path", "max_depth": 8}
 
 
@@ -53,8 +55,8 @@ def picture(scene: Describe, params: Params, variant: str = VARIANT, **settings:
 
     mi.set_variant(variant)  # transforms cannot be made before
     described = scene(mi.ScalarTransform4f())
-    turning = {name.rpartition(".")[0]: UP for name in params} | {"camera": None}
-    render = mitsuba.renderer(described, list(params), axis=turning, variant=variant, **settings)
+    about = turning(params)
+    render = mitsuba.renderer(described, list(params), axis=about, variant=variant, **settings)
     return lambda y, key=None: render({name: of(y) for name, of in params.items()}, key)
 
 
@@ -84,6 +86,38 @@ def dearer(
         "updates": anew(render()),  # its own, or what is there would need no update
         "all": anew(render(resolution=2 * resolution, spp=4 * spp, integrator=LONG_PATHS)),
     }
+
+
+def fidelities(
+    scene: Describe, params: Params, variant: str, sought: Array, resolution: int, spp: int
+) -> list[Level]:
+    """Long paths, from few pixels and samples up to these, beside a photograph."""
+    import mitsuba as mi
+
+    from smoothdiff.renderers import mitsuba
+
+    sharp = {"resolution": resolution, "spp": SHARP * spp, "integrator": LONG_PATHS}
+    photo = np.asarray(picture(scene, params, variant, seed=1, **sharp)(sought))
+
+    def made() -> list[Level]:
+        return mitsuba.levels(
+            scene(mi.ScalarTransform4f()),
+            list(params),
+            photo,
+            spp=spp,
+            integrator=LONG_PATHS,
+            inputs=lambda y: {name: of(y) for name, of in params.items()},
+            axis=turning(params),
+            variant=variant,
+        )
+
+    # a scene of its own for each, as meshes would be moved for all that share them
+    return [made()[i] for i in range(len(made()))]
+
+
+def turning(params: Params) -> dict[str, Any]:
+    """What each object that is named turns about."""
+    return {name.rpartition(".")[0]: UP for name in params} | {"camera": None}
 
 
 def camera(world: Any, origin: Sequence[float], target: Sequence[float], fov: float) -> Description:

@@ -20,6 +20,7 @@ from benchmarks.scenes.mitsuba_scene import (
     Description,
     Params,
     dearer,
+    fidelities,
     picture,
 )
 
@@ -100,6 +101,7 @@ def scene_task(
         start=lambda seed: uniform(jax.random.key(seed)),
         seeds=seeds[full],
         dearer=lambda: dearer(scene, params, resolution, spp, variant),
+        fidelities=partial(fidelities, scene, params, variant, sought),
         notes=f"{resolution} x {resolution} pixels, {spp} samples per pixel, {variant}",
         **named,
     )
