@@ -19,11 +19,12 @@ from tqdm import tqdm
 
 import smoothdiff as sd
 from benchmarks import _registry
-from benchmarks._grid import Grid
+from benchmarks._grid import Grid, short
 from benchmarks._kept import fingerprint, kept
 from benchmarks._loop import behaviour
 from benchmarks._study import setting
 from benchmarks._style import COLOURS, figure
+from benchmarks._summary import quartiles
 from benchmarks._task import NotAble, Task
 from benchmarks.studies._listed import listed
 
@@ -76,8 +77,9 @@ def of_scene(
             path = folder / f"{way}-{seed}-{setting(options)}.npz"
             runs.append(kept(path, stale, run, options.fresh))
         found[way] = {
-            name: [float(run[name]) for run in runs] for name in ("seconds", "call", "left")
+            name: quartiles([run[name] for run in runs]) for name in ("seconds", "call", "left")
         }
+        found[way]["solved"] = sum(np.isfinite(run["seconds"]) for run in runs)
         found[way]["milliseconds"] = runs[-1]["milliseconds"].tolist()
     return found
 
@@ -150,17 +152,13 @@ def seconds(task: Task, level: sd.Level) -> float:
     return min(taken[1:])
 
 
-def ratio(scene: dict[str, Any], way: str, other: str) -> float:
-    """How many times the seconds of another way this one takes, in the median."""
-    return float(np.median(scene[way]["seconds"]) / np.median(scene[other]["seconds"]))
-
-
 def means(results: dict[str, Any]) -> dict[str, float | None]:
-    """Geometric means over the scenes that both ways solve from more than half of the starts."""
+    """Geometric means of ratios of medians, over the scenes that both solve from most starts."""
 
     def mean(way: str, other: str) -> float | None:
-        each = [ratio(scene, way, other) for scene in results["scenes"].values()]
-        known = [value for value in each if np.isfinite(value) and value > 0]
+        pairs = [(scene[way], scene[other]) for scene in results["scenes"].values()]
+        medians = [(a["seconds"]["median"], b["seconds"]["median"]) for a, b in pairs]
+        known = [a / b for a, b in medians if a is not None and b is not None]
         return geometric_mean(known) if known else None
 
     return {
@@ -175,12 +173,11 @@ def tables(results: dict[str, Any]) -> Iterator[Grid]:
     for name, scene in results["scenes"].items():
         line: dict[str, Any] = {"scene": name}
         for way, title in WAYS.items():
-            took, left = scene[way]["seconds"], scene[way]["left"]
-            solved = sum(np.isfinite(took))
-            some = f" ({solved})" if solved < len(took) else ""
-            line[f"{title}, s"] = f"{np.median(took):.2g}{some}"
-            line[f"{way}, call, s"] = f"{np.median(scene[way]['call']):.2g}"
-            line[f"{way}, left, %"] = f"{100 * np.median(left):.2g}"
+            found, solved = scene[way], scene[way]["solved"]
+            some = f" ({solved})" if solved < scene["starts"] else ""
+            line[f"{title}, s"] = short(found["seconds"]["median"]) + some
+            line[f"{way}, call, s"] = short(found["call"]["median"])
+            line[f"{way}, left, %"] = short(100 * found["left"]["median"])
         lines.append(line)
     said = [f"{name}: {mean:.2g}" for name, mean in means(results).items() if mean is not None]
     yield listed(
@@ -194,17 +191,18 @@ def tables(results: dict[str, Any]) -> Iterator[Grid]:
 
 
 def draw(results: dict[str, Any], folder: Path) -> None:
-    """The seconds of each start, by scene and way."""
+    """The seconds of each way from quartile to quartile; none where half do not get there."""
     scenes = results["scenes"]
     with figure(folder / "fidelity.png", 1, 1, (7, 1 + 0.5 * len(scenes))) as (drawn, axes):
         axis, places = axes[0, 0], np.arange(len(scenes))
         for i, (way, title) in enumerate(WAYS.items()):
-            for place, scene in zip(places + 0.2 * (i - 1), scenes.values(), strict=True):
-                took = np.array(scene[way]["seconds"])
-                label = title if place < 0.5 else None
-                at = np.full(took.size, place)
-                axis.plot(took, at, "o", color=COLOURS[i], alpha=0.6, mew=0, label=label)
-                axis.plot(np.median(took), place, "|", color=COLOURS[i], ms=12)
+            each = [scene[way]["seconds"] for scene in scenes.values()]
+            names = "lower", "median", "upper"
+            low, middle, high = (
+                [np.nan if q[name] is None else q[name] for q in each] for name in names
+            )
+            axis.hlines(places + 0.2 * (i - 1), low, high, color=COLOURS[i], lw=5, alpha=0.4)
+            axis.plot(middle, places + 0.2 * (i - 1), "o", color=COLOURS[i], label=title)
         axis.set(xscale="log", xlabel="CPU seconds of rendering to 99 % of the image error")
         axis.set(yticks=places, yticklabels=scenes, ylim=(len(scenes) - 0.5, -0.5))
         drawn.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=3)
