@@ -43,7 +43,7 @@ class Level(NamedTuple):
     Source: own.
     """
 
-    fun: Callable[[PyTree, PyTree], Any]
+    fun: Callable[..., Any]
     cost: float
 
 
@@ -134,8 +134,8 @@ def coarse_to_fine(
         max_cost: the most that all evaluations may cost, in evaluations of the finest level.
         max_seconds: seconds after which no further step begins.
         callback: called with each step's `Record`; the search ends if it returns something true.
-        **options: as for the minimiser: `bounds`, `space`, `sigma`, `solver`, `progress`. Sigma and
-            a solver are for the coarsest level.
+        **options: as for the minimiser: `bounds`, `space`, `sigma`, `solver`, `progress`,
+            `takes_key`. Sigma and a solver are for the coarsest level.
 
     Returns:
         A `CoarseToFine`.
@@ -172,8 +172,7 @@ def coarse_to_fine(
     found = search.run(levels[-1], y, callback=callback, target=target)
     if len(levels) > 1 and search.room(levels[-1], y0) and found.reason in _WELL:
         # one that was led astray
-        value = search.value(levels[-1], y0)
-        if value < found.fun:
+        if search.lower(levels[-1], y0):
             search.run(levels[-1], y0, callback=callback, target=target)
     return search.found()
 
@@ -240,9 +239,17 @@ class _Search:
         solver = dataclasses.replace(found.solver, sigma=sigma)
         self.options = self.options | {"solver": solver, "sigma": None}
 
-    def value(self, level: Level, y: PyTree) -> float:
+    def lower(self, level: Level, y: PyTree) -> bool:
+        """Whether the function is lower at y than at what was found, by the same random numbers."""
+        found = self.results[-1]
+        if not self.options.get("takes_key", False):
+            return self._value(level, y) < found.fun
+        key = jax.random.fold_in(self.key, len(self.results))
+        return self._value(level, y, key) < self._value(level, found.y, key)
+
+    def _value(self, level: Level, y: PyTree, *key: jax.Array) -> float:
         """The function itself at a point, which is an evaluation more."""
-        out = level.fun(y, self.args)
+        out = level.fun(y, self.args, *key)
         self.cost += level.cost / self.unit
         if not self._squares():
             return float(out)

@@ -130,6 +130,24 @@ def test_a_target_a_callback_and_a_time_end_it():
     assert run(max_seconds=0.0).reason == "max_seconds"
 
 
+def test_functions_that_take_a_key_have_fresh_noise_at_all_levels():
+    """The minimum of one key alone is 0.15 away: each number is a mean of sixteen draws."""
+    keys = []
+
+    def level(cost):
+        def fun(y, args, key):
+            jax.debug.callback(lambda key: keys.append(key.tolist()), jax.random.key_data(key))
+            return (y - 1)[None] + 0.6 * jax.random.normal(key, (16, 2))
+
+        return sd.Level(fun, cost)
+
+    options = {"key": KEY, "takes_key": True, "max_cost": 200}
+    found = sd.coarse_to_fine(sd.least_squares, [level(1.0), level(4.0)], jnp.zeros(2), **options)
+    assert len(found.levels) >= 2
+    assert len(set(map(tuple, keys))) > 20
+    np.testing.assert_allclose(found.y, 1, atol=0.075)
+
+
 def test_a_space_holds_at_all_levels():
     fun = lambda tilt: lambda y, args: jnp.stack([jnp.log10(y[0]) + 2 + tilt, y[1] - 3.0])
     levels = [sd.Level(fun(0.2), 1.0), sd.Level(fun(0.0), 9.0)]

@@ -51,7 +51,8 @@ def levels(
         **options: as for `renderer`: `axis`, `sensor`, `variant`, `seed`, `noise`.
 
     Returns:
-        The levels, the coarsest first. Their functions are those of y that `least_squares` wants.
+        The levels, the coarsest first. Their functions are those of y that `least_squares` wants,
+        and take a key too, for `takes_key=True`: without one the noise of an image is fixed.
 
     Raises:
         ValueError: a photograph that is none; as `renderer`.
@@ -85,9 +86,9 @@ def levels(
             scene, params, resolution=(height, width), spp=samples, integrator=light, **options
         )
 
-        def residuals(y: PyTree, args: Any) -> Array:
+        def residuals(y: PyTree, args: Any, key: Array | None = None) -> Array:
             # as long as those of the finest level, but for what is seen there alone
-            return factor * (render(inputs(y)) - seen)
+            return factor * (render(inputs(y), key) - seen)
 
         return Level(residuals, float(height * width * samples * depth))
 
