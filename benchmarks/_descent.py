@@ -17,7 +17,7 @@ import numpy as np
 import optax
 
 import smoothdiff as sd
-from benchmarks._kept import fingerprint
+from benchmarks._cache import fingerprint
 from benchmarks._task import Budget, Key, Method, Problem, Record, Solve, Task, Y
 from benchmarks._tuning import Axis, Rates, Settings
 

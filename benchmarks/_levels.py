@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from benchmarks._kept import fingerprint, kept
+from benchmarks._cache import cached, fingerprint
 from benchmarks._loop import Counter, Recorder, Stop, behaviour
 from benchmarks._task import Budget, Method, Solve, Task, precision_of
 
@@ -63,7 +63,7 @@ class Race:
             for seed in seeds:
                 path = self._folder / f"{name}-{seed}.npz"
                 make = partial(self._run, method, name, settings, seed)
-                rows.append(kept(path, stale, make, self._fresh)["took"])
+                rows.append(cached(path, stale, make, self._fresh)["took"])
         return np.array(rows)
 
     def _run(self, method: Method, name: str, settings: Settings, seed: int) -> dict[str, Any]:

@@ -18,7 +18,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from tqdm import tqdm
 
-from benchmarks._kept import fingerprint, kept
+from benchmarks._cache import cached, fingerprint
 from benchmarks._machine import commit, here
 from benchmarks._task import (
     Budget,
@@ -284,7 +284,7 @@ def run(
             stale = fingerprint(as_it_is, method.source, sorted(keep))
             if isinstance(found[method], list):
                 try:
-                    made = kept(path, stale, partial(runner, method, seed), fresh)
+                    made = cached(path, stale, partial(runner, method, seed), fresh)
                     found[method].append(made)
                 except NotAble as reason:
                     found[method] = reason

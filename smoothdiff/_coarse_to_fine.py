@@ -170,10 +170,10 @@ def coarse_to_fine(
         y = found.y
         search.narrower(level.cost / dearer.cost)
     found = search.run(levels[-1], y, callback=callback, target=target)
-    if len(levels) > 1 and search.room(levels[-1], y0) and found.reason in _WELL:
-        # one that was led astray
-        if search.lower(levels[-1], y0):
-            search.run(levels[-1], y0, callback=callback, target=target)
+    again = len(levels) > 1 and search.room(levels[-1], y0) and found.reason in _WELL
+    # one that was led astray
+    if again and search.lower(levels[-1], y0):
+        search.run(levels[-1], y0, callback=callback, target=target)
     return search.found()
 
 

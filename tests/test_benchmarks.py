@@ -18,7 +18,7 @@ from stripes import REFERENCE, build, halving, registered
 
 from benchmarks import __main__ as cli
 from benchmarks import _loop, _registry, _study
-from benchmarks._kept import kept
+from benchmarks._cache import cached
 from benchmarks._summary import cost_to_level, quartiles
 from benchmarks._task import Budget, Method, NotAble, Problem, Score, Task
 from benchmarks._timing import in_turns
@@ -221,14 +221,14 @@ def test_long_traces_are_thinned_and_keep_their_end():
 
 def test_what_is_kept_is_whole_or_not_there(tmp_path):
     path = tmp_path / "a.npz"
-    made = kept(path, "1", lambda: {"x": np.arange(3), "said": {"a": [1, None]}})
-    found = kept(path, "1", lambda: {})
+    made = cached(path, "1", lambda: {"x": np.arange(3), "said": {"a": [1, None]}})
+    found = cached(path, "1", lambda: {})
     assert found["said"] == made["said"]
     assert np.array_equal(found["x"], made["x"])
-    assert kept(path, "2", lambda: {"other": 1}) == {"other": 1}
+    assert cached(path, "2", lambda: {"other": 1}) == {"other": 1}
     with pytest.raises(TypeError):
-        kept(path, "3", lambda: {"x": object()})
-    assert kept(path, "2", lambda: {}) == {"other": 1}
+        cached(path, "3", lambda: {"x": object()})
+    assert cached(path, "2", lambda: {}) == {"other": 1}
 
 
 def test_levels_not_reached_cost_infinity():

@@ -19,8 +19,8 @@ from tqdm import tqdm
 
 import smoothdiff as sd
 from benchmarks import _registry
+from benchmarks._cache import cached, fingerprint
 from benchmarks._grid import Grid, short
-from benchmarks._kept import fingerprint, kept
 from benchmarks._loop import behaviour
 from benchmarks._study import setting
 from benchmarks._style import COLOURS, figure
@@ -75,7 +75,7 @@ def of_scene(
                 return made[0].run(way, seed)
 
             path = folder / f"{way}-{seed}-{setting(options)}.npz"
-            runs.append(kept(path, stale, run, options.fresh))
+            runs.append(cached(path, stale, run, options.fresh))
         found[way] = {
             name: quartiles([run[name] for run in runs]) for name in ("seconds", "call", "left")
         }

@@ -19,8 +19,8 @@ from tqdm import tqdm
 
 import smoothdiff as sd
 from benchmarks import _registry
+from benchmarks._cache import cached, fingerprint
 from benchmarks._grid import Grid
-from benchmarks._kept import fingerprint, kept
 from benchmarks._summary import quartiles
 from benchmarks._task import NotAble
 from benchmarks.studies._listed import dots, listed
@@ -128,7 +128,7 @@ def measure(options: Namespace, folder: Path) -> dict[str, Any]:
             for factor in took:
                 path = folder / "runs" / name / f"{seed}-{factor}.npz"
                 make = partial(trace, case, seed, factor)
-                runs[factor] = kept(path, SOURCE, make, options.fresh)
+                runs[factor] = cached(path, SOURCE, make, options.fresh)
             lowest = min(np.min(run["errors"]) for run in runs.values())
             for factor, run in runs.items():
                 took[factor].append(there(run, lowest))

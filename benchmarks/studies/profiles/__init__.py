@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks._kept import fingerprint, kept
+from benchmarks._cache import cached, fingerprint
 from benchmarks._study import setting
 from benchmarks._task import NotAble, precision
 from benchmarks.studies.profiles import ours, peers
@@ -74,7 +74,7 @@ def of_panel(
             stale = fingerprint(behaviour, method.source, budget)
             try:
                 make = partial(trace, method, case, budget)
-                of_case[name] = kept(path, stale, make, options.fresh)
+                of_case[name] = cached(path, stale, make, options.fresh)
             except NotAble as reason:
                 missing[method.title] = str(reason)
         found.append(of_case)

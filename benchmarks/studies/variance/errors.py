@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from benchmarks._kept import fingerprint, kept
+from benchmarks._cache import cached, fingerprint
 from benchmarks._timing import in_turns
 from benchmarks.studies.variance.estimators import Estimator, Part
 from benchmarks.studies.variance.problems import PROBLEMS, Problem
@@ -88,7 +88,7 @@ def rows(
     parts = [p for p in estimator.parts(found.problem, num) if asked.issuperset(p.quantities)]
     losses = [float(found.problem.fun(y)) for y in found.positions[:2]]
     arrays = (np.round(array, 6) for array in (found.positions, *found.truth.values()))
-    stored = kept(
+    stored = cached(
         path,
         fingerprint(estimator, num, losses, *arrays),
         lambda: {name: row for part in parts for name, row in _measure(found, part).items()},

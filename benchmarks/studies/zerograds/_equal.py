@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from benchmarks._kept import fingerprint, kept
+from benchmarks._cache import cached, fingerprint
 from benchmarks._task import Problem, Task
 from benchmarks._tuning import Best, Rates, Settings, geometric_mean, seeds, walk
 from benchmarks.studies.zerograds._runs import FLOOR, about
@@ -81,7 +81,7 @@ class Program:
             some = list(starts[first : first + TOGETHER])
             path = self._folder / f"{self._name}-{schedule}-{rate:g}-{some[0]}-{len(some)}.npz"
             make = partial(self._run, schedule, rate, some)
-            rows.append(kept(path, self._source, make, self._fresh)["errors"])
+            rows.append(cached(path, self._source, make, self._fresh)["errors"])
         return np.concatenate(rows)
 
     def _run(self, schedule: str, rate: float, starts: list[int]) -> dict[str, np.ndarray]:

@@ -23,8 +23,8 @@ from tqdm import trange
 
 import smoothdiff as sd
 from benchmarks import _registry
+from benchmarks._cache import cached, fingerprint
 from benchmarks._grid import Grid, Row, short
-from benchmarks._kept import fingerprint, kept
 from benchmarks._summary import quarters
 from benchmarks._task import Problem, Task
 from benchmarks.methods import adam, zerograds
@@ -79,7 +79,7 @@ def measure(starts: int, folder: Path, fresh: bool) -> dict[str, Any]:
             follow, runs = following(name, task), []
             for seed in trange(starts, desc=f"{task_name}: {name}", unit="run"):
                 path = folder / task_name / f"gradient-{name}-{seed}.npz"
-                runs.append(kept(path, _fingerprint(task, seed), partial(follow, seed), fresh))
+                runs.append(cached(path, _fingerprint(task, seed), partial(follow, seed), fresh))
             tasks[task_name][name] = {row: quarters([run[row] for run in runs]) for row in ROWS}
     return {"tasks": tasks}
 

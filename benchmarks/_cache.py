@@ -12,7 +12,7 @@ import numpy as np
 JSON, FINGERPRINT = "json", "fingerprint"
 
 
-def kept(
+def cached(
     path: Path, fingerprint: str, make: Callable[[], Mapping[str, Any]], fresh: bool = False
 ) -> dict[str, Any]:
     """What `make` gives: from its file if that has the same fingerprint, else made and written.
@@ -20,7 +20,7 @@ def kept(
     Args:
         path: The file, ending in .npz.
         fingerprint: Changes when what is made would.
-        make: Gives what is to be kept by name: NumPy arrays, and what JSON knows.
+        make: Gives what is to be stored by name: NumPy arrays, and what JSON knows.
         fresh: Make it anew in any case.
     """
     if not fresh and path.exists():
