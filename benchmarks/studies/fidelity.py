@@ -79,7 +79,7 @@ def of_scene(
         found[way] = {
             name: quartiles([run[name] for run in runs]) for name in ("seconds", "call", "left")
         }
-        found[way]["solved"] = sum(np.isfinite(run["seconds"]) for run in runs)
+        found[way]["solved"] = int(sum(np.isfinite(run["seconds"]) for run in runs))
         found[way]["milliseconds"] = runs[-1]["milliseconds"].tolist()
     return found
 
@@ -184,8 +184,8 @@ def tables(results: dict[str, Any]) -> Iterator[Grid]:
         "Cheap renders first",
         f"{results['pixels']} x {results['pixels']} pixels, {results['samples']} samples of each, "
         "paths of length 8. CPU seconds of rendering to 99 % of the image error, CPU seconds of "
-        "the call until then with compiling, and what is left at the end; medians. Geometric means "
-        f"of seconds of rendering: {'; '.join(said)}.",
+        "the call until then, of which a first start compiles, and what is left at the end; medians. "
+        f"Geometric means of seconds of rendering: {'; '.join(said)}.",
         lines,
     )
 
