@@ -184,8 +184,8 @@ def tables(results: dict[str, Any]) -> Iterator[Grid]:
         "Cheap renders first",
         f"{results['pixels']} x {results['pixels']} pixels, {results['samples']} samples of each, "
         "paths of length 8. CPU seconds of rendering to 99 % of the image error, CPU seconds of "
-        "the call until then, of which a first start compiles, and what is left at the end; medians. "
-        f"Geometric means of seconds of rendering: {'; '.join(said)}.",
+        "the call until then, of which a first start compiles, and what is left at the end. "
+        f"Medians; geometric means of seconds of rendering: {'; '.join(said)}.",
         lines,
     )
 
