@@ -1,6 +1,7 @@
 """What is chosen where the user chooses nothing: the solver and its sigma."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -20,21 +21,25 @@ from smoothdiff._solvers import (
 )
 from smoothdiff._support import MovingSupport, as_support
 
-# sigma as a share of a parameter's range, or else of the largest number of its leaf
-_SHARE = 0.2
+# sigma as a share of a parameter's range, or else of the largest number of its leaf; and of the
+# range for residuals that are evaluated point by point, where first points far apart tell most
+_SHARE, _WIDE = 0.2, 0.4
 # a step of Adam, in sigmas
 _RATE = 0.15
 # so many parameters on a term, in the mean, can be searched for by themselves
 _FEW = 10
 
 
-def default_sigma(y: PyTree[Array], bounds: tuple[PyTree, PyTree] | None) -> PyTree[Array]:
-    """A fifth of each parameter's range; without one a fifth of the largest number of its leaf.
+def default_sigma(
+    y: PyTree[Array], bounds: tuple[PyTree, PyTree] | None, share: float = _SHARE
+) -> PyTree[Array]:
+    """A share of each parameter's range; without one a fifth of the largest number of its leaf.
 
     It is 0.2 where all numbers of a leaf without a range are zero.
     """
     leaves, treedef = jax.tree.flatten(y)
-    return treedef.unflatten(map(_width, leaves, *_sides(y, bounds)))
+    width = partial(_width, share)
+    return treedef.unflatten(map(width, leaves, *_sides(y, bounds)))
 
 
 def default_solver(
@@ -49,7 +54,8 @@ def default_solver(
 
     `anywhere` says that no sigma is the user's, who does not ask to look around the start.
     """
-    usual = default_sigma(y, bounds)
+    by_points = residuals and support is None and GaussNewton(1.0).sizes(y) is not None
+    usual = default_sigma(y, bounds, _WIDE if by_points else _SHARE)
     if sigma is None:
         sigma = usual
     elif not callable(sigma):
@@ -117,10 +123,10 @@ def _in_sigmas(sigma: PyTree) -> optax.GradientTransformation:
     return optax.stateless(update)
 
 
-def _width(leaf: Array, low: Any, high: Any) -> Array:
+def _width(share: float, leaf: Array, low: Any, high: Any) -> Array:
     size = float(np.max(np.abs(np.asarray(leaf)), initial=0.0)) or 1.0
     width = jnp.full(leaf.shape, _SHARE * size, leaf.dtype)
     if low is None or high is None:
         return width
     span = jnp.broadcast_to(jnp.asarray(high) - jnp.asarray(low), leaf.shape).astype(leaf.dtype)
-    return jnp.where(jnp.isfinite(span) & (span > 0), _SHARE * span, width)
+    return jnp.where(jnp.isfinite(span) & (span > 0), share * span, width)

@@ -177,7 +177,9 @@ def least_squares(
             `LocalGaussNewton(sigma, support)`; or `LocalCrossEntropy(support)`, if no sigma is
             given, all bounds are finite, the support does not move, and a term has at most ten
             parameters on average. It may be an optimistix solver around one of ours.
-        sigma: as for `minimise`.
+        sigma: as for `minimise`. But within bounds, with fewer than 100 parameters and without a
+            support, the default is two fifths of a parameter's range: residuals of points far apart
+            tell most. A `space` says its own.
         support: which residuals each parameter may move, as for `LocalGaussNewton`.
         target: as for `minimise`; half the sum of squares.
         max_evaluations: as for `minimise`.
