@@ -111,6 +111,15 @@ def test_sigma_is_a_share_of_the_range_or_of_the_start(y0, bounds, sigma):
         np.testing.assert_allclose(one, other, rtol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("size", "bounds", "sigma"),
+    [(2, (-1.0, 4.0), 2.0), (2, None, 0.6), (2, (-1.0, None), 0.6), (100, (-1.0, 4.0), 1.0)],
+)
+def test_residuals_point_by_point_begin_with_two_fifths_of_a_range(size, bounds, sigma):
+    found = default_solver(jnp.full(size, 3.0), bounds, None, residuals=True)
+    np.testing.assert_allclose(found.sigma, np.full(size, sigma), rtol=1e-6)
+
+
 @pytest.mark.slow
 def test_ten_starts_on_stairs_need_no_setting():
     found = [float(sd.minimise(stairs, jnp.zeros(3), key=jax.random.key(k)).fun) for k in range(5)]

@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 import smoothdiff as sd
 from benchmarks import _registry
-from benchmarks._cache import cached, fingerprint
+from benchmarks._cache import cached, fingerprint, library
 from benchmarks._grid import Grid, short
 from benchmarks._loop import behaviour
 from benchmarks._study import setting
@@ -65,7 +65,7 @@ def of_scene(
     """The runs of each way, kept one by one."""
     found: dict[str, Any] = {"title": task.title, "starts": len(seeds)}
     made: list[Fidelities] = []
-    stale = fingerprint(behaviour(task), SIZE[options.full], MOST, MOST_CHEAP, TURNS)
+    stale = fingerprint(library(), behaviour(task), SIZE[options.full], MOST, MOST_CHEAP, TURNS)
     for way in WAYS:
         runs = []
         for seed in tqdm(seeds, desc=f"{task.name}, {way}", leave=False):

@@ -68,10 +68,9 @@ class Center(eqx.Module):
     ) -> tuple["Center", Float[Array, ""], Float[Array, ""]]:
         """The next center; the smoothed function at this one, and its standard error.
 
-        It `returns` to the lowest sample from a step that led nowhere, or not. The last samples may
-        be all `level`.
-        `small` says whether a step is too small to lead anywhere. Where the function
-        `takes_key`, samples are no nearer to each other than noise allows.
+        It `returns` to the lowest sample from a step that led nowhere, or not. `level` says whether
+        the last samples all have one value, `small` whether a step is too small to lead anywhere.
+        Where the function `takes_key`, samples are no nearer to each other than noise allows.
         """
         theta, metric, trust = self.theta, self.metric, self.trust
         model = fit(metric.into(points - theta[None]) / trust.width, values, valid)

@@ -151,8 +151,7 @@ class ValueSearch(ValueState):
         history, average = self.history, self.average
         keyed, known = average is not None, (history.points, history.funs, history.valid)
         returns = ~self.patient(self.searches) & ~self.noisy & (not keyed)
-        last = history.funs[-sizes.first :], history.valid[-sizes.first :]
-        level = are_level(*last)
+        level = are_level(*self.last(sizes))
         center, *_ = self.center.stepped(params, *known, True, returns, level, takes_key=keyed)
         # a metric can overflow where the function is flat
         finite = all_finite((center.theta, center.metric, center.trust.width))

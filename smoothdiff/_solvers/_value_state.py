@@ -177,5 +177,8 @@ class ValueState(AbstractPointSearch):
 
     def at_bottom(self, sizes: Sizes, width: Float[Array, ""]) -> Bool[Array, ""]:
         """Whether the last evaluations, so far apart, say that nothing lower is near."""
-        funs, valid = self.history.funs[-sizes.first :], self.history.valid[-sizes.first :]
-        return rounding_alone(funs, valid, width)
+        return rounding_alone(*self.last(sizes), width)
+
+    def last(self, sizes: Sizes) -> tuple[Float[Array, " K"], Bool[Array, " K"]]:
+        """The values of the last round of samples, and which of them count."""
+        return self.history.funs[-sizes.first :], self.history.valid[-sizes.first :]

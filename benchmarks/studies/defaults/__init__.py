@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 import smoothdiff as sd
 from benchmarks import _registry
-from benchmarks._cache import cached, fingerprint
+from benchmarks._cache import cached, library
 from benchmarks._grid import Grid
 from benchmarks._summary import quartiles
 from benchmarks._task import NotAble
@@ -30,13 +30,11 @@ HELP = "the shortest call against the best of hand-chosen settings"
 OPTIONS = ("names", "fresh")
 TASKS = ("shadow", "mug", "bunny", "box2", "quad", "brdf")
 STARTS = 10
-FACTORS = (0.125, 0.25, 0.5, 1.0, 2.0)  # of the default sigma
-SHARE = 0.2  # of a range, the default sigma
+FACTORS = (0.125, 0.25, 0.5, 1.0, 2.0)  # of a fifth of a range
+SHARE = 0.2  # of a range, the sigma of factor 1
 BUDGET = 150
 LEVEL = 0.01
 TARGET = 1.3
-FILES = sorted(Path(sd.__file__).parent.glob("**/*.py"))
-SOURCE = fingerprint(*(path.read_text() for path in FILES))
 
 
 class Case(NamedTuple):
@@ -128,7 +126,7 @@ def measure(options: Namespace, folder: Path) -> dict[str, Any]:
             for factor in took:
                 path = folder / "runs" / name / f"{seed}-{factor}.npz"
                 make = partial(trace, case, seed, factor)
-                runs[factor] = cached(path, SOURCE, make, options.fresh)
+                runs[factor] = cached(path, library(), make, options.fresh)
             lowest = min(np.min(run["errors"]) for run in runs.values())
             for factor, run in runs.items():
                 took[factor].append(there(run, lowest))
