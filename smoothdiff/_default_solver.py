@@ -19,27 +19,25 @@ from smoothdiff._solvers import (
     LocalGaussNewton,
     NewtonCG,
 )
+from smoothdiff._spaces import SIGMA
 from smoothdiff._support import MovingSupport, as_support
 
-# sigma as a share of a parameter's range, or else of the largest number of its leaf; and of the
-# range for residuals that are evaluated point by point, where first points far apart tell most
-_SHARE, _WIDE = 0.2, 0.4
+# sigma as a share of the largest number of a leaf whose parameters have no range
+_SHARE = 0.2
+# and of a range for residuals that are evaluated point by point: first points far apart tell most
+_WIDE = 0.4
 # a step of Adam, in sigmas
 _RATE = 0.15
 # so many parameters on a term, in the mean, can be searched for by themselves
 _FEW = 10
 
 
-def default_sigma(
-    y: PyTree[Array], bounds: tuple[PyTree, PyTree] | None, share: float = _SHARE
-) -> PyTree[Array]:
-    """A share of each parameter's range; without one a fifth of the largest number of its leaf.
-
-    It is 0.2 where all numbers of a leaf without a range are zero.
-    """
-    leaves, treedef = jax.tree.flatten(y)
-    width = partial(_width, share)
-    return treedef.unflatten(map(width, leaves, *_sides(y, bounds)))
+def share_of_range(
+    y: PyTree[Array], residuals: bool, support: Callable[[PyTree], Array] | None = None
+) -> float:
+    """The default sigma as a share of a range."""
+    by_points = residuals and support is None and GaussNewton(1.0).sizes(y) is not None
+    return _WIDE if by_points else SIGMA
 
 
 def default_solver(
@@ -54,8 +52,7 @@ def default_solver(
 
     `anywhere` says that no sigma is the user's, who does not ask to look around the start.
     """
-    by_points = residuals and support is None and GaussNewton(1.0).sizes(y) is not None
-    usual = default_sigma(y, bounds, _WIDE if by_points else _SHARE)
+    usual = _usual(y, bounds, share_of_range(y, residuals, support))
     if sigma is None:
         sigma = usual
     elif not callable(sigma):
@@ -75,6 +72,12 @@ def default_solver(
     if NewtonCG(1.0).sizes(y) is not None:
         return NewtonCG(sigma)
     return FirstOrder(optax.chain(optax.scale_by_adam(), _in_sigmas(sigma)), sigma)
+
+
+def _usual(y: PyTree[Array], bounds: tuple[PyTree, PyTree] | None, share: float) -> PyTree[Array]:
+    """A share of each range; without one a fifth of the largest number of the leaf, or 0.2."""
+    leaves, treedef = jax.tree.flatten(y)
+    return treedef.unflatten(map(partial(_width, share), leaves, *_sides(y, bounds)))
 
 
 def _sides(y: PyTree[Array], bounds: tuple[PyTree, PyTree] | None) -> tuple[list, list]:

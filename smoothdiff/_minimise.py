@@ -18,7 +18,7 @@ from smoothdiff._call_checks import (
     check_solver,
     explained,
 )
-from smoothdiff._default_solver import default_solver
+from smoothdiff._default_solver import default_solver, share_of_range
 from smoothdiff._host_samples import BlackBoxError
 from smoothdiff._host_steps import HostProblem
 from smoothdiff._limits import Limits
@@ -177,9 +177,8 @@ def least_squares(
             `LocalGaussNewton(sigma, support)`; or `LocalCrossEntropy(support)`, if no sigma is
             given, all bounds are finite, the support does not move, and a term has at most ten
             parameters on average. It may be an optimistix solver around one of ours.
-        sigma: as for `minimise`. But within bounds, with fewer than 100 parameters and without a
-            support, the default is two fifths of a parameter's range: residuals of points far apart
-            tell most. A `space` says its own.
+        sigma: as for `minimise`. But with fewer than 100 parameters and without a support, the
+            default is two fifths of a parameter's range: residuals of points far apart tell most.
         support: which residuals each parameter may move, as for `LocalGaussNewton`.
         target: as for `minimise`; half the sum of squares.
         max_evaluations: as for `minimise`.
@@ -250,10 +249,11 @@ def _run(
     if space is not None:
         fun, y0 = units.wrap(fun), units.unit(y0)
         bounds = units.bounds()
-        sigma = units.sigma() if sigma is None and solver is None else sigma
     y = jax.tree.map(inexact, y0)
     if solver is None:
         residuals = interface is optx.AbstractLeastSquaresSolver
+        if space is not None and sigma is None:
+            sigma = units.sigma(share_of_range(y, residuals, support))
         solver = default_solver(y, bounds, sigma, residuals, support, anywhere)
     else:
         check_solver(solver, interface, example, sigma, support)

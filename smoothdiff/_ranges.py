@@ -8,7 +8,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from smoothdiff._spaces import SIGMA, AbstractSpace, Numbers, fit, floating, refuse
+from smoothdiff._spaces import AbstractSpace, Numbers, fit, floating, refuse
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,7 +22,8 @@ class Range(AbstractSpace):
             parameter.
         high: the largest value, itself included, likewise.
         log: on a logarithmic scale, for a parameter that may be small by any factor.
-        sigma: the smoothing width as a share of the range, by default a fifth.
+        sigma: the smoothing width as a share of the range. By default what the call takes of any
+            range: a fifth, `least_squares` often two fifths.
         label: a name for plots, such as "width (mm)"; or one for each number of the parameter.
 
     Raises:
@@ -84,6 +85,9 @@ class Range(AbstractSpace):
         """Zero and one."""
         return 0.0, 1.0
 
+    def _default_width(self, share: float) -> float:
+        return share
+
     @property
     def axis_scale(self) -> Literal["linear", "log"]:
         """The scale of the range."""
@@ -129,8 +133,8 @@ class Integer(AbstractSpace):
     Args:
         low: the least number, or one for each number of the parameter.
         high: the largest number, itself included, likewise.
-        sigma: the smoothing width as a share of the n intervals. By default a fifth, and at least
-            half an interval: within much less of its middle there is a single number.
+        sigma: the smoothing width as a share of the n intervals. By default as for `Range`, and at
+            least half an interval: within much less of its middle there is a single number.
         label: a name for plots, such as "layers"; or one for each number of the parameter.
 
     Raises:
@@ -183,8 +187,8 @@ class Integer(AbstractSpace):
     def _count(self) -> np.ndarray:
         return np.asarray(np.subtract(self.high, self.low) + 1)
 
-    def _default_sigma(self) -> Any:
-        return np.maximum(SIGMA, 0.5 / self._count())
+    def _default_width(self, share: float) -> Any:
+        return np.maximum(share, 0.5 / self._count())
 
     def _check_dtype(self, dtype: np.dtype, name: str) -> None:
         super()._check_dtype(dtype, name)

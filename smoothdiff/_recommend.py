@@ -13,7 +13,7 @@ from jaxtyping import PyTree
 
 from smoothdiff._black_box import UnknownOutputError
 from smoothdiff._call_checks import check_call, check_number, check_residuals, explained
-from smoothdiff._default_solver import default_solver
+from smoothdiff._default_solver import default_solver, share_of_range
 from smoothdiff._host_steps import evaluator, rows_at
 from smoothdiff._limits import Limits
 from smoothdiff._look_around import WIDEST, View, look_around
@@ -136,9 +136,10 @@ def recommend(
     units = UnitSpace.of(y0, space)
     if space is not None:
         fun, y0, bounds = units.wrap(fun), units.unit(y0), units.bounds()
-        sigma = units.sigma() if sigma is None else sigma
     y = jax.tree.map(inexact, y0)
     squares, spent = _residuals(fun, y, args)
+    if space is not None and sigma is None:
+        sigma = units.sigma(share_of_range(y, squares))
     solver = default_solver(y, bounds, sigma, squares)
     params = take_apart(y, solver.sigma, bounds)
     n = params.theta.size

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from smoothdiff._default_solver import default_solver
+from smoothdiff._default_solver import default_solver, share_of_range
 from smoothdiff._host_steps import HostSteps
 from smoothdiff._params import as_key, layout_of
 from smoothdiff._run import inexact
@@ -82,9 +82,10 @@ class Search:
         if space is not None:
             units = UnitSpace.of(y0, space)
             self._natural, unit, bounds = units.natural, units.unit, units.bounds()
-            sigma = units.sigma() if sigma is None and solver is None else sigma
         self._unit = lambda y: jax.tree.map(inexact, unit(y))
         self._y = self._unit(y0)
+        if space is not None and solver is None and sigma is None:
+            sigma = units.sigma(share_of_range(self._y, residuals))
         if solver is None:
             solver = default_solver(self._y, bounds, sigma, residuals)
             solver = eqx.tree_at(lambda s: s.nonfinite, solver, "drop")

@@ -17,7 +17,8 @@ from smoothdiff._params import is_concrete
 # spaces are equal, hash and print by value
 Numbers = ArrayLike | Sequence
 
-# the smoothing width in unit coordinates, unless there is a reason for another
+# the smoothing width in unit coordinates, unless there is a reason for another; of a range the
+# share that it is
 SIGMA = 0.2
 
 
@@ -33,7 +34,7 @@ class AbstractSpace(abc.ABC):
 
     Args:
         sigma: the smoothing width in unit coordinates, a number or one for each number of the
-            parameter; by default what the subclass says.
+            parameter; by default what the subclass says, see `width`.
         label: a name for plots, with the unit; or one for each number of the parameter.
 
     Raises:
@@ -61,11 +62,14 @@ class AbstractSpace(abc.ABC):
     label: Any = None
 
     def __post_init__(self):
-        if self.sigma is None:
-            object.__setattr__(self, "sigma", self._default_sigma())
-        self._number("sigma", positive=True)
+        if self.sigma is not None:
+            self._number("sigma", positive=True)
         if self.label is not None and not isinstance(self.label, str):
             object.__setattr__(self, "label", _tuples(np.asarray(self.label, str).tolist()))
+
+    def width(self, share: float = SIGMA) -> Any:
+        """The smoothing width in unit coordinates: sigma, or by default `share` of a range."""
+        return self._default_width(share) if self.sigma is None else self.sigma
 
     @abc.abstractmethod
     def to_unit(self, y: ArrayLike) -> Array:
@@ -109,7 +113,8 @@ class AbstractSpace(abc.ABC):
 
     def _check_dtype(self, dtype: np.dtype, name: str) -> None:
         """Raises ValueError if the dtype of the parameter cannot hold the space."""
-        self._check_held("sigma", dtype, name)
+        if self.sigma is not None:
+            self._check_held("sigma", dtype, name)
 
     def _check_start(self, y0: np.ndarray, name: str) -> None:
         """Raises ValueError if the space does not hold the start."""
@@ -125,7 +130,8 @@ class AbstractSpace(abc.ABC):
                 "in float64, or in other units"
             )
 
-    def _default_sigma(self) -> Any:
+    def _default_width(self, share: float) -> Any:
+        del share  # of a range, which this is not
         return SIGMA
 
     def _number(

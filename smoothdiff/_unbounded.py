@@ -125,7 +125,8 @@ class Positive(AbstractSpace):
     def _scale(self, like: Array) -> Array:
         return fit(1.0 if self.scale is None else self.scale, like)
 
-    def _default_sigma(self) -> float:
+    def _default_width(self, share: float) -> float:
+        del share
         return math.log(2)
 
     def _check_dtype(self, dtype: np.dtype, name: str) -> None:
@@ -194,7 +195,8 @@ class Periodic(AbstractSpace):
         u = floating(u)
         return fit(self.low, u) + fit(self.period, u) * u
 
-    def _default_sigma(self) -> float:
+    def _default_width(self, share: float) -> float:
+        del share
         return SIGMA / 2
 
     def _check_dtype(self, dtype: np.dtype, name: str) -> None:

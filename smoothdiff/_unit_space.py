@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from smoothdiff._spaces import AbstractSpace, floating
+from smoothdiff._spaces import SIGMA, AbstractSpace, floating
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,9 +91,13 @@ class UnitSpace:
         low, high = zip(*ends, strict=True)
         return self.treedef.unflatten(low), self.treedef.unflatten(high)
 
-    def sigma(self) -> PyTree:
-        """The smoothing width in unit coordinates, None where there is no space to say it."""
-        widths = [None if s is None else np.asarray(s.sigma, float) for s in self.spaces]
+    def sigma(self, share: float = SIGMA) -> PyTree:
+        """The smoothing width in unit coordinates, None where there is no space to say it.
+
+        Args:
+            share: of each range whose space does not say its own.
+        """
+        widths = [None if s is None else np.asarray(s.width(share), float) for s in self.spaces]
         return self.treedef.unflatten(widths)
 
     def labels(self) -> list[str]:

@@ -69,10 +69,10 @@ def test_residuals_with_a_dead_parameter_and_the_names_of_spaces():
     y0 = {"r": 0.1, "k": 0.5, "dead": 3.0}
     advice = recommend(fun, y0, jnp.asarray(2.0), key=KEY, space=space)
     assert said(advice.seen, "dead changes nothing")
-    assert said(advice.seen, "within sigma: rate 1.8, k 0.32, dead 0")
+    assert said(advice.seen, "within sigma: rate 3.7, k 0.32, dead 0")
     assert said(advice.advice, "a larger sigma for dead")
     assert {name: round(float(s), 3) for name, s in advice.sigma.items()} == {
-        "r": 0.2,
+        "r": 0.4,
         "k": 0.1,
         "dead": 0.6,
     }

@@ -120,6 +120,19 @@ def test_residuals_point_by_point_begin_with_two_fifths_of_a_range(size, bounds,
     np.testing.assert_allclose(found.sigma, np.full(size, sigma), rtol=1e-6)
 
 
+@pytest.mark.parametrize(("run", "width"), [(sd.minimise, 0.2), (sd.least_squares, 0.4)])
+@pytest.mark.parametrize("own", [None, 0.1])
+def test_a_space_and_the_same_bounds_have_one_default(run, width, own):
+    low, high = jnp.array([-1.0, 0.0]), jnp.array([1.0, 4.0])
+    fun = (lambda y, _: y) if run is sd.least_squares else (lambda y, _: jnp.sum(y**2))
+    call = lambda **where: run(fun, jnp.ones(2), key=KEY, max_steps=1, **where).solver.sigma
+    found = call(space=sd.Range(low, high, sigma=own))
+    np.testing.assert_allclose(found, np.full(2, own or width), rtol=1e-6)
+    if own is None:
+        bounded = call(bounds=(low, high)) / (high - low)
+        np.testing.assert_allclose(bounded, np.full(2, width), rtol=1e-6)
+
+
 @pytest.mark.slow
 def test_ten_starts_on_stairs_need_no_setting():
     found = [float(sd.minimise(stairs, jnp.zeros(3), key=jax.random.key(k)).fun) for k in range(5)]
