@@ -19,6 +19,7 @@ from smoothdiff._solvers import (
     LocalGaussNewton,
     NewtonCG,
 )
+from smoothdiff._solvers._base import sigma_at
 from smoothdiff._spaces import SIGMA
 from smoothdiff._support import MovingSupport, as_support
 
@@ -117,13 +118,15 @@ def _is_none(leaf: Any) -> bool:
 
 
 def _in_sigmas(sigma: PyTree) -> optax.GradientTransformation:
-    """A step of so many sigmas of each parameter, downhill."""
+    """A step of so many sigmas of each parameter, downhill; sigma may be a schedule."""
 
-    def update(updates: PyTree[Array], _: PyTree) -> PyTree[Array]:
-        widths = jax.tree.broadcast(sigma, updates)
-        return jax.tree.map(lambda u, s: (-_RATE * s * u).astype(u.dtype), updates, widths)
+    def update(updates: PyTree, state: optax.ScaleByScheduleState, params: Any = None) -> tuple:
+        del params
+        widths = jax.tree.broadcast(sigma_at(sigma, state.count), updates)
+        scaled = jax.tree.map(lambda u, s: (-_RATE * s * u).astype(u.dtype), updates, widths)
+        return scaled, optax.ScaleByScheduleState(optax.safe_increment(state.count))
 
-    return optax.stateless(update)
+    return optax.GradientTransformation(optax.scale_by_schedule(lambda _: _RATE).init, update)
 
 
 def _width(share: float, leaf: Array, low: Any, high: Any) -> Array:

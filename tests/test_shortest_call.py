@@ -120,6 +120,15 @@ def test_residuals_point_by_point_begin_with_two_fifths_of_a_range(size, bounds,
     np.testing.assert_allclose(found.sigma, np.full(size, sigma), rtol=1e-6)
 
 
+def test_a_schedule_of_sigma_sets_the_steps_of_many_parameters():
+    falls = lambda step: 0.4 / (1 + step)
+    options = {"sigma": falls, "max_steps": 3, "keep_iterates": True}
+    result = sd.minimise(lambda y, _: jnp.sum(y**2), jnp.ones(100), key=KEY, **options)
+    np.testing.assert_allclose([r.sigma for r in result.history], [0.4, 0.2, 0.4 / 3], rtol=1e-6)
+    # a first step of Adam is 0.15 sigma of each parameter
+    np.testing.assert_allclose(np.abs(np.asarray(result.history[0].y) - 1), 0.15 * 0.4, rtol=1e-3)
+
+
 @pytest.mark.parametrize(("run", "width"), [(sd.minimise, 0.2), (sd.least_squares, 0.4)])
 @pytest.mark.parametrize("own", [None, 0.1])
 def test_a_space_and_the_same_bounds_have_one_default(run, width, own):
