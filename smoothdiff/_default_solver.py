@@ -120,7 +120,7 @@ def _is_none(leaf: Any) -> bool:
 def _in_sigmas(sigma: PyTree) -> optax.GradientTransformation:
     """A step of so many sigmas of each parameter, downhill; sigma may be a schedule."""
 
-    def update(updates: PyTree, state: optax.ScaleByScheduleState, params: Any = None) -> tuple:
+    def update(updates: PyTree, state: Any, params: Any = None) -> tuple:
         del params
         widths = jax.tree.broadcast(sigma_at(sigma, state.count), updates)
         scaled = jax.tree.map(lambda u, s: (-_RATE * s * u).astype(u.dtype), updates, widths)

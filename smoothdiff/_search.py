@@ -82,10 +82,10 @@ class Search:
         if space is not None:
             units = UnitSpace.of(y0, space)
             self._natural, unit, bounds = units.natural, units.unit, units.bounds()
+            if solver is None and sigma is None:
+                sigma = units.sigma(share_of_range(units.unit(y0), residuals))
         self._unit = lambda y: jax.tree.map(inexact, unit(y))
         self._y = self._unit(y0)
-        if space is not None and solver is None and sigma is None:
-            sigma = units.sigma(share_of_range(self._y, residuals))
         if solver is None:
             solver = default_solver(self._y, bounds, sigma, residuals)
             solver = eqx.tree_at(lambda s: s.nonfinite, solver, "drop")
