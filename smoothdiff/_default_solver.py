@@ -119,14 +119,14 @@ def _is_none(leaf: Any) -> bool:
 
 def _in_sigmas(sigma: PyTree) -> optax.GradientTransformation:
     """A step of so many sigmas of each parameter, downhill; sigma may be a schedule."""
+    if callable(sigma):
+        return optax.scale_by_schedule(lambda step: -_RATE * sigma_at(sigma, step))
 
-    def update(updates: PyTree, state: Any, params: Any = None) -> tuple:
-        del params
-        widths = jax.tree.broadcast(sigma_at(sigma, state.count), updates)
-        scaled = jax.tree.map(lambda u, s: (-_RATE * s * u).astype(u.dtype), updates, widths)
-        return scaled, optax.ScaleByScheduleState(optax.safe_increment(state.count))
+    def update(updates: PyTree[Array], _: PyTree) -> PyTree[Array]:
+        widths = jax.tree.broadcast(sigma, updates)
+        return jax.tree.map(lambda u, s: (-_RATE * s * u).astype(u.dtype), updates, widths)
 
-    return optax.GradientTransformation(optax.scale_by_schedule(lambda _: _RATE).init, update)
+    return optax.stateless(update)
 
 
 def _width(share: float, leaf: Array, low: Any, high: Any) -> Array:

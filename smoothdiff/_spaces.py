@@ -68,7 +68,14 @@ class AbstractSpace(abc.ABC):
             object.__setattr__(self, "label", _tuples(np.asarray(self.label, str).tolist()))
 
     def width(self, share: float = SIGMA) -> Any:
-        """The smoothing width in unit coordinates: sigma, or by default `share` of a range."""
+        """The smoothing width in unit coordinates.
+
+        Args:
+            share: of a range, where sigma was left out.
+
+        Returns:
+            Sigma, or the default: a number, or one for each number of the parameter.
+        """
         return self._default_width(share) if self.sigma is None else self.sigma
 
     @abc.abstractmethod
