@@ -120,7 +120,7 @@ def _is_none(leaf: Any) -> bool:
 def _in_sigmas(sigma: PyTree) -> optax.GradientTransformation:
     """A step of so many sigmas of each parameter, downhill; sigma may be a schedule."""
     if callable(sigma):
-        return optax.scale_by_schedule(lambda step: -_RATE * sigma_at(sigma, step))
+        return optax.scale_by_schedule(lambda step: -_RATE * sigma_at(sigma, jnp.asarray(step)))
 
     def update(updates: PyTree[Array], _: PyTree) -> PyTree[Array]:
         widths = jax.tree.broadcast(sigma, updates)
