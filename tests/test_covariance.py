@@ -214,8 +214,12 @@ def test_an_answer_of_an_earlier_search_is_evaluated_again():
 
 
 @pytest.mark.slow
-def test_ripples_on_logarithmic_ranges_are_no_slopes():
-    """A few calls give the closed form of the function without its jumps."""
+@pytest.mark.parametrize(("sigma", "calls"), [(0.2, 5), (None, 8)])
+def test_ripples_on_logarithmic_ranges_are_no_slopes(sigma, calls):
+    """A few calls give the closed form of the function without its jumps.
+
+    After first points that are farther away, by default, it takes a few more.
+    """
     phases = 30 * jax.random.normal(jax.random.key(7), (60, 4))
     t = jnp.linspace(0.0, 3.0, 60)
     curve = lambda y: y["a"] * jnp.exp(-y["b"] * t) * jnp.cos(y["w"] * t + y["c"])
@@ -225,12 +229,12 @@ def test_ripples_on_logarithmic_ranges_are_no_slopes():
         return curve(y) + 0.03 * (phase - jnp.floor(phase) - 0.5)
 
     truth = {"a": 2.0, "b": 0.4, "w": 6.0, "c": 0.3}
-    space = {name: sd.Range(1e-3, 10.0, log=True) for name in truth}
+    space = {name: sd.Range(1e-3, 10.0, log=True, sigma=sigma) for name in truth}
     data = noisy(curve, truth, 0.3)
     result = fitted(rippled, data, truth, space=space, max_steps=12)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # it says what is not known yet
-        for _ in range(5):
+        for _ in range(calls):
             result = sd.with_covariance(lambda y, data: rippled(y) - data, result, data)
     errors = ravel_pytree(result.parameter_errors)[0]
     np.testing.assert_allclose(errors, np.sqrt(np.diag(expected(curve, result))), rtol=0.2)
