@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from smoothdiff._baselines import AbstractBaseline, Mean
 from smoothdiff._least_squares import PolynomialControl
+from smoothdiff._products import dot
 
 
 class ADSlope(AbstractBaseline):
@@ -36,7 +37,7 @@ class ADSlope(AbstractBaseline):
     def __call__(self, values, draws, log_ratio, valid, center):
         self.check_gaussian(draws)
         (leaf,), treedef = jax.tree.flatten(values)
-        along = lambda z, _: jnp.matmul(z, center, precision="highest")
+        along = lambda z, _: dot(z, center)
         small = leaf - draws.map(along).astype(leaf.dtype)
         rest = Mean()(small, draws, log_ratio, valid, None)
         coefficients = jnp.append(rest.mean, center.astype(rest.mean.dtype))

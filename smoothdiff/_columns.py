@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from smoothdiff._products import dot
+
 
 class Columns:
     """Outputs of N samples, less their level, as an array of N rows."""
@@ -19,7 +21,7 @@ class Columns:
         self._leaves, self._tree = jax.tree.flatten(values)
         flat = [leaf.reshape(len(weights), -1) for leaf in self._leaves]
         # the level first, or its rounding would be all that is left of small differences
-        self._levels = [jnp.matmul(weights.astype(v.dtype), v, precision="highest") for v in flat]
+        self._levels = [dot(weights.astype(v.dtype), v) for v in flat]
         parts = [
             (v - level[None]).astype(counts.dtype) * counts[:, None]
             for v, level in zip(flat, self._levels, strict=True)

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, PyTree
 from smoothdiff._batch import Batch
 from smoothdiff._noise import NoiseSampler
 from smoothdiff._params import Params
+from smoothdiff._products import combined, dot
 from smoothdiff._support import term_weights
 
 
@@ -65,9 +66,9 @@ def _log_gaussian(z: Array, shift: Array, ratio: Array | None) -> Array:
     if shift.ndim == 2:
         log_w = jnp.sum(z * scaled, axis=1) - jnp.sum(shift * shift, axis=1) / 2
     else:
-        log_w = jnp.matmul(z, scaled, precision="highest") - jnp.sum(shift * shift) / 2
+        log_w = dot(z, scaled) - jnp.sum(shift * shift) / 2
     if ratio is not None:
-        log_w += jnp.matmul(z * z, (1 - ratio**2) / 2, precision="highest")
+        log_w += dot(z * z, (1 - ratio**2) / 2)
         log_w += jnp.sum(jnp.log(ratio))
     return log_w
 
@@ -94,9 +95,7 @@ def combine(
         w = weights(batch, z, log_ratio, shift, ratio)
         if w.ndim > 1:
             return jax.tree.map(lambda r: jnp.sum(weigh(w, r), axis=0), residual)
-        return jax.tree.map(
-            lambda r: jnp.tensordot(w.astype(r.dtype), r, axes=1, precision="highest"), residual
-        )
+        return jax.tree.map(lambda r: combined(w, r), residual)
 
     total = batch.draws.sum(chunk, batch.control.residual)
     back = batch.control.smoothed(shift, ratio)

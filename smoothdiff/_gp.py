@@ -21,6 +21,7 @@ from smoothdiff._baselines import AbstractBaseline, Control
 from smoothdiff._columns import Columns
 from smoothdiff._draws import Draws
 from smoothdiff._leave_out import group_share, leave_out, left_out_group
+from smoothdiff._products import combined, dot
 
 
 class GPControl(Control):
@@ -43,16 +44,14 @@ class GPControl(Control):
         m = s * shift
 
         def chunk(start, z, log_ratio, alpha):
-            row = jnp.matmul(z, m, precision="highest") / shift.size
+            row = dot(z, m) / shift.size
             if self.length is not None:
                 square = self.length**2 * shift.size
                 narrow = 1 / (square + s**2)
-                away = jnp.matmul(z * z, narrow, precision="highest") + jnp.sum(m * m * narrow)
-                away -= 2 * jnp.matmul(z, m * narrow, precision="highest")
+                away = dot(z * z, narrow) + jnp.sum(m * m * narrow)
+                away -= 2 * dot(z, m * narrow)
                 row += jnp.exp((jnp.sum(jnp.log(square * narrow)) - away) / 2)
-            return jax.tree.map(
-                lambda a: jnp.tensordot(row.astype(a.dtype), a, axes=1, precision="highest"), alpha
-            )
+            return jax.tree.map(lambda a: combined(row, a), alpha)
 
         total = self.draws.sum(chunk, self.alpha)
         return jax.tree.map(jnp.add, total, self.level)
@@ -122,11 +121,11 @@ class GaussianProcess(AbstractBaseline):
             solved[:, 1 : draws.num + 1],
             solved[:, draws.num + 1 :],
         )
-        mean = free * ones / jnp.dot(counts, ones, precision="highest")
+        mean = free * ones / dot(counts, ones)
 
         def constrained(solved: Array, y: Array) -> tuple[Array, Array]:
             """The coefficients and the constant of the fit to values y."""
-            constant = jnp.matmul(mean, y, precision="highest")
+            constant = dot(mean, y)
             return solved - ones[:, None] * constant[None], constant
 
         inverse, _ = constrained(inverse, unit)
@@ -150,10 +149,11 @@ class GaussianProcess(AbstractBaseline):
 
         def rows(z: Array, _: Any) -> Array:
             def columns(y: Array, _: Any) -> Array:
-                dot = jnp.matmul(y, z.T, precision="highest")
-                out = dot / draws.n
+                product = dot(y, z.T)
+                out = product / draws.n
                 if self.length is not None:
-                    apart = jnp.sum(y * y, axis=1)[:, None] + jnp.sum(z * z, axis=1)[None] - 2 * dot
+                    apart = jnp.sum(y * y, axis=1)[:, None] + jnp.sum(z * z, axis=1)[None]
+                    apart -= 2 * product
                     out += jnp.exp(-jnp.maximum(apart, 0) / (2 * self.length**2 * draws.n))
                 return out
 

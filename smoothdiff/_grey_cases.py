@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from smoothdiff._products import dot
 from smoothdiff._solvers import _batch_by_batch
 from smoothdiff._solvers.gauss_newton import GaussNewton
 
@@ -200,7 +201,7 @@ def _nearest(shown: Array, pictures: Array) -> tuple[Int[Array, " cases"], Float
     """For each picture the number of the render that is nearest, and its loss."""
     flat, wanted = shown.reshape(len(shown), -1), pictures.reshape(len(pictures), -1)
     # nearest by products of matrices, and then exactly
-    apart = jnp.sum(flat**2, axis=1)[None] - 2 * wanted @ flat.T
+    apart = jnp.sum(flat**2, axis=1)[None] - 2 * dot(wanted, flat.T)
     nearest = jnp.argmin(_finite(apart), axis=1)
     return nearest, _finite(jnp.mean((flat[nearest] - wanted) ** 2, axis=1))
 

@@ -14,6 +14,7 @@ from smoothdiff._columns import Columns
 from smoothdiff._draws import Draws
 from smoothdiff._gp import GaussianProcess
 from smoothdiff._leave_out import group_share, leave_out, left_out_group
+from smoothdiff._products import combined, dot
 
 Terms = Literal["linear", "diagonal", "full"]
 
@@ -37,10 +38,7 @@ class PolynomialControl(Control):
         """The polynomial's smoothed value, exactly."""
         s = jnp.ones_like(shift) if ratio is None else 1 / ratio
         row = _features((s * shift)[None], self.terms, (s * s - 1)[None])[0]
-        return jax.tree.map(
-            lambda c: jnp.tensordot(row.astype(c.dtype), c, axes=1, precision="highest"),
-            self.coefficients,
-        )
+        return jax.tree.map(lambda c: combined(row, c), self.coefficients)
 
 
 class LeastSquares(AbstractBaseline):
@@ -100,18 +98,18 @@ class LeastSquares(AbstractBaseline):
 
         def blocks(index: np.ndarray) -> Array:
             part = q[index]
-            hat = jnp.einsum("bik,bjk->bij", part, part, precision="highest")
+            hat = dot(part, part.mT)
             return jnp.eye(index.shape[1], dtype=q.dtype)[None] - hat
 
         columns = Columns(values, counts / jnp.sum(counts), counts)
         small = columns.small
-        along = jnp.matmul(q.T, small, precision="highest")
-        residual = small - jnp.matmul(q, along, precision="highest")
+        along = dot(q.T, small)
+        residual = small - dot(q, along)
         left_out = leave_out(residual, blocks, group or 1)
         if group is not None:
             residual = left_out
             weighted = left_out * group_share(counts, group)[:, None]
-            along = along - jnp.matmul(q.T, weighted, precision="highest")
+            along = along - dot(q.T, weighted)
         coefficients = columns.with_level(jax.scipy.linalg.solve_triangular(r, along))
         residual, left_out = columns.rows(residual), columns.rows(left_out)
         return PolynomialControl(residual, left_out, coefficients, terms)

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, PyTree
 from smoothdiff._batch import Batch
 from smoothdiff._estimate import objective
 from smoothdiff._params import Layout
+from smoothdiff._products import dot
 from smoothdiff._stderr import grad_stderr, hvp_stderr, value_stderr
 
 
@@ -149,7 +150,7 @@ class QuadraticModel(eqx.Module):
     def __call__(self, step: PyTree) -> Array:
         """The model's value at the parameters plus `step`."""
         half = jax.tree.map(lambda g, h: g + h / 2, self.grad, self.hessian.mv(step))
-        dots = jax.tree.map(lambda a, b: jnp.vdot(a, b, precision="highest"), half, step)
+        dots = jax.tree.map(lambda a, b: dot(a.reshape(-1), b.reshape(-1)), half, step)
         return self.value + _sum(jax.tree.leaves(dots), self.value.dtype)
 
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from smoothdiff._products import dot
 from smoothdiff._select import Selection, select
 
 __all__ = ["MLP", "Quadratic", "Selection", "select"]
@@ -98,4 +99,4 @@ class Quadratic(eqx.Module):
         """The surrogate at one point."""
         # only the symmetric part of the matrix has an effect, so nothing needs to keep it symmetric
         v = jnp.append(u, 1)
-        return jnp.vdot(v, self.matrix @ v)
+        return dot(v, dot(self.matrix, v))

@@ -223,11 +223,6 @@ def project(y: PyTree[Array], bounds: tuple[PyTree, PyTree] | None) -> PyTree[Ar
     return treedef.unflatten(leaves)
 
 
-def dot(a: Array, b: Array) -> Array:
-    """The matrix product, as precise as its dtype also where the hardware would be faster."""
-    return jnp.matmul(a, b, precision="highest")
-
-
 def all_finite(tree: PyTree[Array]) -> Bool[Array, ""]:
     """Whether there is no NaN and no infinity in any leaf."""
     return jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(tree)]).all()

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from smoothdiff._solvers._base import dot
+from smoothdiff._products import dot
 
 # steps along the bounds at most, and the shares of each that are tried and clipped
 _TIMES, _SHARES = 10, tuple(2.0**-k for k in range(6))

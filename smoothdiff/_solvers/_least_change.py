@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from smoothdiff._solvers._base import dot
+from smoothdiff._products import dot
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._metric import Metric
 

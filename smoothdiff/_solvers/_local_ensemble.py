@@ -30,7 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from smoothdiff._solvers._base import dot
+from smoothdiff._products import dot
 from smoothdiff._support import AbstractSupport
 
 # of each step, in units of the mean diagonal

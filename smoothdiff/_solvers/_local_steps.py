@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from smoothdiff._solvers._base import dot
+from smoothdiff._products import dot
 from smoothdiff._solvers._residual_batch import centred
 
 # the damping of each step, in units of the largest squared singular value

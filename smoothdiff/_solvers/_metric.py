@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from smoothdiff._products import dot
+
 # most parameters for which directions are adapted with the widths; beyond, widths only, O(n)
 MOST_DIRECTIONS = 64
 # the most that a width changes in a step, relative to the others
@@ -121,15 +123,12 @@ class Metric(eqx.Module):
         widths /= jnp.exp(jnp.mean(jnp.log(widths)))
         if vectors is None:
             return Metric(self.matrix * widths, self.inverse / widths), Metric(widths, 1 / widths)
-        turn, back = (
-            jnp.matmul(vectors * size[None], vectors.T, precision="highest")
-            for size in (widths, 1 / widths)
-        )
-        matrix = jnp.matmul(self.matrix, turn, precision="highest")
+        turn, back = (dot(vectors * size[None], vectors.T) for size in (widths, 1 / widths))
+        matrix = dot(self.matrix, turn)
         return Metric(matrix, jnp.linalg.inv(matrix)), Metric(turn, back)
 
 
 def _apply(factor: Array, rows: Array) -> Array:
     if factor.ndim == 2:
-        return jnp.matmul(rows, factor.T, precision="highest")
+        return dot(rows, factor.T)
     return rows * (factor if rows.ndim == 1 else factor[None])

@@ -12,7 +12,7 @@ Source: our own; the criticality step of Conn, Scheinberg and Vicente 2009 has t
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from smoothdiff._solvers._base import dot
+from smoothdiff._products import dot
 from smoothdiff._solvers._least_change import Quadratic
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._ratio_test import TELLING

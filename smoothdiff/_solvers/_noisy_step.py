@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from smoothdiff._products import dot
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._scalar_fit import ScalarFit
 from smoothdiff._solvers._trust_region import truncated_cg
@@ -115,18 +116,18 @@ def propose(
     most = math.sqrt(grad.size)
     reach = jnp.minimum(radius * sure, most)
     p = confine(truncated_cg(curvature, believed, reach))
-    reduction = -(jnp.vdot(believed, p) + jnp.vdot(p, curvature(p)) / 2)
+    reduction = -(dot(believed, p) + dot(p, curvature(p)) / 2)
     # bounds can leave of a step what is worse than none
     p = jnp.where(reduction > 0, p, 0)
     undamped = truncated_cg(curvature, hold(turn.out(grad)), jnp.minimum(radius, most))
-    bent = jnp.abs(jnp.vdot(undamped, curvature(undamped)))
+    bent = jnp.abs(dot(undamped, curvature(undamped)))
     ahead = turn.out(undamped)
     error_ahead = model.slope_stderr(at, _ratio(ahead, jnp.linalg.norm(ahead)))
     return Step(
         p=p,
         reduction=jnp.maximum(reduction, 0),
         undamped=jnp.linalg.norm(undamped),
-        spread=_ratio(error_ahead * jnp.vdot(undamped, undamped), bent),
+        spread=_ratio(error_ahead * dot(undamped, undamped), bent),
         edge=jnp.linalg.norm(p) >= _EDGE * reach,
         insignificant=~jnp.any(believed != 0),
         constant=size == 0,

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from smoothdiff._solvers._base import dot
+from smoothdiff._products import dot
 
 # how far the linear model is trusted, in units of sigma
 _REACH = 3.0

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
-from smoothdiff._solvers._base import all_finite, dot
+from smoothdiff._products import dot
+from smoothdiff._solvers._base import all_finite
 from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._least_change import least_change

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from smoothdiff._solvers._base import dot
+from smoothdiff._products import dot
 from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._point_search import powers_of_two

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from smoothdiff._solvers._base import dot
+from smoothdiff._products import dot
 
 # (share of curvatures, share of the rest): mostly the rest, mostly a quadratic, a quadratic
 _SHARES = ((0.1, 1.0), (1.0, 0.1), (1.0, 0.0))
@@ -112,8 +112,8 @@ class ScalarFit(eqx.Module):
     def _covariance(self, a: Array, b: Array) -> Array:
         """Of the smoothed function at two places, before any sample."""
         n = a.size
-        product = jnp.vdot(a, b)
-        curved = (product**2 + jnp.vdot(a, a) + jnp.vdot(b, b) + n) / n**2
+        product = dot(a, b)
+        curved = (product**2 + dot(a, a) + dot(b, b) + n) / n**2
         height = (n / (n + 2)) ** (n / 2)
         rest = height * jnp.exp(-jnp.sum((a - b) ** 2) / (2 * (n + 2)))
         return product / n + self.curved * curved + self.radial * rest
@@ -123,7 +123,7 @@ class ScalarFit(eqx.Module):
         explained = self._explained(self._value_features(at))
         ones = self._explained(jnp.ones_like(self.closeness))
         left = self._covariance(at, at) - jnp.sum(explained**2)
-        constant = (1 - jnp.vdot(explained, ones)) ** 2 / jnp.sum(ones**2)
+        constant = (1 - dot(explained, ones)) ** 2 / jnp.sum(ones**2)
         return self.amplitude * jnp.sqrt(jnp.maximum(left + constant, 0))
 
     def difference_stderr(self, at: Float[Array, " n"]) -> Float[Array, ""]:
@@ -147,20 +147,20 @@ class ScalarFit(eqx.Module):
     def slope_stderr(self, at: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, ""]:
         """The standard error of the gradient along a unit vector."""
         slopes, radials = self._grad_features(at)
-        along = jnp.vdot(at, v)
+        along = dot(at, v)
         features = slopes * dot(self.points, v) - radials * along
         return self._stderr(features, self._grad_prior(at, along**2))
 
     def _grad_prior(self, at: Array, along: Array) -> Array:
         n = at.size
-        curved = 2 * self.curved / n**2 * (along + jnp.vdot(at, at))
+        curved = 2 * self.curved / n**2 * (along + dot(at, at))
         return curved + 1 / n + self.radial * (n / (n + 2)) ** (n / 2) / (n + 2)
 
     def curvature_stderr(self, at: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, ""]:
         """The standard error of v·Hv, for a unit vector."""
         n = at.size
         along = dot(self.points, v)
-        away = along - jnp.vdot(at, v)
+        away = along - dot(at, v)
         radials = self._radial_terms(at) / (n + 1)
         features = 2 * self.curved * along**2 / n**2 + radials * (away**2 / (n + 1) - 1)
         rest = 3 * self.radial * (n / (n + 2)) ** (n / 2) / (n + 2) ** 2
@@ -204,10 +204,10 @@ def fit(
         kernel = weights * (gram + curved * gram**2 + rest * radial)
         factor = jnp.linalg.cholesky(kernel + ridge * jnp.eye(values.size, dtype=dtype))
         solved = jax.scipy.linalg.cho_solve((factor, True), sides)
-        mass = jnp.vdot(sides[:, 0], solved[:, 0])
-        constant = jnp.vdot(sides[:, 0], solved[:, 1]) / mass
+        mass = dot(sides[:, 0], solved[:, 0])
+        constant = dot(sides[:, 0], solved[:, 1]) / mass
         left = solved[:, 1] - constant * solved[:, 0]
-        misfit = jnp.vdot(sides[:, 1] - constant * sides[:, 0], left) / count
+        misfit = dot(sides[:, 1] - constant * sides[:, 0], left) / count
         misfit = jnp.maximum(misfit, jnp.finfo(dtype).tiny)
         volume = jnp.sum(jnp.log(jnp.diagonal(factor)))
         volume -= (values.size - count) / 2 * jnp.log(ridge)

@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from smoothdiff._products import dot
+
 _MOST_STEPS = 100
 
 
@@ -31,13 +33,13 @@ def truncated_cg(
     def advance(state):
         step, p, residual, direction, _ = state
         bent = curvature(direction)
-        along = jnp.vdot(direction, bent)
-        size = jnp.vdot(residual, residual)
+        along = dot(direction, bent)
+        size = dot(residual, residual)
         alpha = size / jnp.where(along > 0, along, 1)
         beyond = (along <= 0) | (jnp.linalg.norm(p + alpha * direction) >= radius)
         p_new = p + jnp.where(beyond, _to_boundary(p, direction, radius), alpha) * direction
         residual_new = residual + alpha * bent
-        beta = jnp.vdot(residual_new, residual_new) / size
+        beta = dot(residual_new, residual_new) / size
         return step + 1, p_new, residual_new, beta * direction - residual_new, beyond
 
     start = 0, jnp.zeros_like(grad), grad, -grad, ~(jnp.linalg.norm(grad) > 0)
@@ -46,7 +48,7 @@ def truncated_cg(
 
 def _to_boundary(p: Array, direction: Array, radius: Array) -> Array:
     """The positive t with |p + t d| = r."""
-    a, b = jnp.vdot(direction, direction), jnp.vdot(p, direction)
-    c = jnp.vdot(p, p) - radius**2
+    a, b = dot(direction, direction), dot(p, direction)
+    c = dot(p, p) - radius**2
     # b is not negative along conjugate gradients from zero, so nothing cancels in the denominator
     return -c / (b + jnp.sqrt(jnp.maximum(b * b - a * c, 0)))

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
+from smoothdiff._products import dot
 from smoothdiff._solvers._averaging import apart
-from smoothdiff._solvers._base import dot
 from smoothdiff._solvers._history import History, alike
 from smoothdiff._solvers._parameter_regression import gauss_newton_step
 from smoothdiff._solvers._residual_batch import centred

@@ -12,10 +12,11 @@ parts of about 2 √n unknowns on a surface, memory and one solve cost O(n^1.5).
 import math
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+
+from smoothdiff._products import dot
 
 LANDMARKS = 8  # distances from so many vertices tell where a vertex is
 
@@ -39,15 +40,11 @@ class BlockInverse(NamedTuple):
             jnp.asarray(each, b.dtype) for each in (self.blocks, self.couplings, self.schur)
         )
         inside = b.at[self.insides].get(mode="fill", fill_value=0)
-        up = _product(jnp.swapaxes(couplings, 1, 2), inside)
-        at_separator = _product(schur, b[self.separator].at[self.borders].add(-up, mode="drop"))
+        up = dot(jnp.swapaxes(couplings, 1, 2), inside)
+        at_separator = dot(schur, b[self.separator].at[self.borders].add(-up, mode="drop"))
         border = at_separator.at[self.borders].get(mode="fill", fill_value=0)
-        inside = _product(blocks, inside) - _product(couplings, border)
+        inside = dot(blocks, inside) - dot(couplings, border)
         return jnp.concatenate([inside.reshape(-1, b.shape[1]), at_separator])[self.places]
-
-
-def _product(a: Array, b: Array) -> Array:
-    return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)  # by default a GPU rounds to TF32
 
 
 def block_inverse(

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from smoothdiff._params import is_concrete
+from smoothdiff._products import dot
 from smoothdiff.filters._elimination import block_inverse
 from smoothdiff.filters._triangles import as_faces, cotangents, edges, vertex_normals
 from smoothdiff.filters.grid import Filter, Scale
@@ -148,7 +149,7 @@ def mesh_bilateral(
         _check_signal(signal, faces)
         _check_positions(guide, signal)
         normals = vertex_normals(guide, faces).astype(signal.dtype)
-        cosines = jnp.matmul(normals, jnp.asarray(directions.T, signal.dtype), precision="highest")
+        cosines = dot(normals, jnp.asarray(directions.T, signal.dtype))
         near, to = (
             jnp.exp((cosines - 1) / jnp.asarray(scale, signal.dtype))
             for scale in (sigma_d, sigma_phi)
