@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from awaited import awaited
 from closed_forms import as_users_have_it
 
 import smoothdiff as sd
@@ -335,7 +336,7 @@ def test_a_result_that_does_not_match_always_raises(returned, out, message):
 def test_a_batch_of_the_wrong_length_raises():
     box = black_box(lambda x: x[:1], SCALAR, batched=True)
     with pytest.raises(BlackBoxError, match=r"batch of 4: .*shape \(1,\) instead of \(4,\)"):
-        jax.vmap(box)(jnp.arange(4.0))
+        awaited(jax.vmap(box), jnp.arange(4.0))
 
 
 def test_arguments_are_read_only():
@@ -540,11 +541,6 @@ def test_large_arguments_are_abbreviated():
     assert len(str(info.value)) < 4000
 
 
-def awaited(f, x):
-    with reraise():
-        return jax.block_until_ready(f(jnp.asarray(x)))
-
-
 def test_reraise_gives_the_original_as_the_cause():
     f = jax.jit(jax.vmap(black_box(fragile, 0.0)))
     for _ in range(2):  # JAX raises another type of error from the second call on
@@ -645,7 +641,7 @@ def test_nan_on_error_of_a_batch_is_the_whole_batch():
     got = jax.vmap(black_box(host, 0.0, batched=True, on_error="nan"))(jnp.ones(3))
     assert np.isnan(got).all()
     with pytest.raises(BlackBoxError, match=r"'host', batch of 3: raised ValueError: all lost"):
-        jax.vmap(black_box(host, 0.0, batched=True))(jnp.ones(3))
+        awaited(jax.vmap(black_box(host, 0.0, batched=True)), jnp.ones(3))
 
 
 @pytest.mark.parametrize("batched", [False, True])
@@ -656,7 +652,7 @@ def test_nonfinite_results(bad, batched):
     out = (0.0, np.zeros(2))
     xs, ys = jnp.arange(4.0), jnp.ones(4)
     with pytest.raises(BlackBoxError, match=r"sample 2 of 4: .*not finite") as info:
-        jax.vmap(black_box(host, out, batched=batched))(xs, ys)
+        awaited(jax.vmap(black_box(host, out, batched=batched)), xs, ys)
     assert "<lambda>(array(2., dtype=float32), array(1., dtype=float32))" in str(info.value)
     box = black_box(host, out, batched=batched, on_nonfinite="nan")
     first, second = jax.jit(jax.vmap(box))(xs, ys)
@@ -748,11 +744,11 @@ def test_the_first_failure_cancels_what_has_not_begun():
         pool.submit(gate.wait)  # holds the only worker until everything is in the queue
         threading.Timer(0.2, gate.set).start()
         with pytest.raises(BlackBoxError, match="sample 0 of 50"):
-            jax.vmap(black_box(host, 0.0, executor=pool))(jnp.arange(50.0))
+            awaited(jax.vmap(black_box(host, 0.0, executor=pool)), jnp.arange(50.0))
     assert len(seen) < 50
     box, counted = black_box(host, 0.0), len(seen)
     with pytest.raises(BlackBoxError, match="sample 0 of 50"):
-        jax.vmap(box)(jnp.arange(50.0))
+        awaited(jax.vmap(box), jnp.arange(50.0))
     assert len(seen) == counted + 1
 
 
@@ -766,7 +762,7 @@ def test_timeout(threads):
 
     box = black_box(host, 0.0, executor=threads, timeout=0.5)
     with pytest.raises(BlackBoxError, match=r"TimeoutError: no result within 0\.5 s") as info:
-        jax.vmap(box)(jnp.arange(4.0))
+        awaited(jax.vmap(box), jnp.arange(4.0))
     assert isinstance(info.value.__cause__, TimeoutError)
     box = black_box(host, 0.0, executor=threads, timeout=0.5, on_error="nan", retries=1)
     release.set()

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from awaited import awaited
 
 import smoothdiff as sd
 from smoothdiff._dask import OnDask
@@ -74,7 +75,7 @@ def test_calls_go_out_in_few_messages(size, client, monkeypatch):
 def test_what_runs_when_another_call_fails_is_kept(client, tmp_path):
     f = box(client, host_functions.fails_if_negative, store=tmp_path / "store")
     with pytest.raises(sd.BlackBoxError, match="sample 0 of 22: raised ValueError: negative"):
-        jax.vmap(f)(jnp.append(jnp.array([-0.3, 0.8]), 0.2 + jnp.arange(20) / 64))
+        awaited(jax.vmap(f), jnp.append(jnp.array([-0.3, 0.8]), 0.2 + jnp.arange(20) / 64))
     kept = {float(value) for _, value in sd.load_store(tmp_path / "store")}
     assert np.float32(0.8) in kept
     assert len(kept) < 10  # what no worker had was not begun
@@ -107,7 +108,7 @@ def test_a_worker_that_dies_or_hangs_loses_its_call_alone(at, client):
     want = [0.5, np.nan, -1.0, 0.0, 0.0, 0.0]
     np.testing.assert_array_equal(jax.vmap(f)(xs), want)
     with pytest.raises(sd.BlackBoxError, match="sample 1 of 6: raised"):
-        jax.vmap(box(client, timeout=6.0))(xs)
+        awaited(jax.vmap(box(client, timeout=6.0)), xs)
     np.testing.assert_array_equal(jax.vmap(box(client))(xs.at[1].set(0.0)), [0.5, 0, -1, 0, 0, 0])
 
 

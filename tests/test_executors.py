@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from awaited import awaited
 from closed_forms import as_users_have_it
 
 import smoothdiff as sd
@@ -40,7 +41,7 @@ def box(workers, fun=host_functions.fault, **options):
 def test_a_fault_in_a_worker_is_that_of_its_sample(at, workers):
     xs = jnp.array([0.25, at, -0.5])
     with pytest.raises(sd.BlackBoxError, match=rf"(?s)sample 1 of 3: .*{FAULTS[at]}") as info:
-        jax.vmap(box(workers))(xs)
+        awaited(jax.vmap(box(workers)), xs)
     assert f"fault(array({at}., dtype=float32))" in str(info.value)
     many = jax.vmap(box(workers, on_error="nan"))(xs)
     np.testing.assert_array_equal(many, [0.5, np.nan, -1.0])
@@ -101,7 +102,7 @@ def test_a_broken_pool_of_others_names_the_calls_that_may_have_done_it():
     with concurrent.futures.ProcessPoolExecutor(1, mp_context=spawn) as pool:
         f = sd.black_box(host_functions.fault, 0.0, executor=pool, on_error="nan", retries=3)
         with pytest.raises(sd.BlackBoxError, match=r"sd\.Processes\(4\) replaces") as info:
-            jax.vmap(f)(jnp.array([2.0, 0.25]))
+            awaited(jax.vmap(f), jnp.array([2.0, 0.25]))
     assert "fault(array(2., dtype=float32))" in str(info.value)
 
 
@@ -145,7 +146,7 @@ def test_threads_that_all_hang_are_said_to_be_lost():
         many = jax.vmap(f)(jnp.array([0.0, 1.0, 0.0]))
         np.testing.assert_array_equal(many, [0.0, np.nan, 0.0])
         with pytest.raises(sd.BlackBoxError, match=r"no worker is left.*sd\.Processes\(4\)"):
-            jax.vmap(f)(jnp.array([2.0, 0.0, 0.0]))
+            awaited(jax.vmap(f), jnp.array([2.0, 0.0, 0.0]))
         release.set()
     with concurrent.futures.ThreadPoolExecutor(2) as pool:
         assert sd.black_box(host, 0.0, executor=pool, timeout=20)(2.0) == 2.0
@@ -168,7 +169,7 @@ def test_results_are_taken_as_they_come():
     with concurrent.futures.ThreadPoolExecutor(2) as pool:
         f = sd.black_box(host, 0.0, executor=pool)
         with pytest.raises(sd.BlackBoxError, match="sample 0 of 4: raised ValueError: the slowest"):
-            jax.vmap(f)(jnp.arange(4.0))
+            awaited(jax.vmap(f), jnp.arange(4.0))
     assert sorted(stored) == [1.0, 2.0, 3.0]
 
 

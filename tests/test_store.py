@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from awaited import awaited
 from closed_forms import as_users_have_it
 
 import smoothdiff as sd
@@ -167,7 +168,7 @@ def test_a_batch_that_fails_keeps_what_succeeded(threaded, path):
     with concurrent.futures.ThreadPoolExecutor(1) as pool:
         host, executor = Counted(bad=(2.0,)), pool if threaded else None
         with pytest.raises(sd.BlackBoxError, match=r"sample 2 of 4: .*no licence"):
-            jax.vmap(sd.black_box(host, 0.0, store=path, executor=executor))(xs)
+            awaited(jax.vmap(sd.black_box(host, 0.0, store=path, executor=executor)), xs)
     assert stored(path).items() >= {0.0: 0.0, 1.0: 2.0}.items()
     before = len(stored(path))
     host = Counted()
@@ -193,7 +194,7 @@ def test_calls_under_way_when_a_batch_fails_are_kept(path):
     with concurrent.futures.ThreadPoolExecutor(2) as pool:
         f = sd.black_box(host, 0.0, executor=pool, store=path)
         with pytest.raises(sd.BlackBoxError, match="first"):
-            jax.vmap(f)(jnp.arange(2.0))
+            awaited(jax.vmap(f), jnp.arange(2.0))
         assert stored(path) == {}
         go_on.set()
         ended.wait(20)
@@ -214,7 +215,7 @@ def test_neither_errors_nor_nan_are_kept(batched, path):
     assert stored(path) == {0.0: 0.0, 2.0: 2.0}
     f = sd.black_box(host, 0.0, batched=batched, store=path)
     with pytest.raises(sd.BlackBoxError, match="not finite"):
-        jax.vmap(f)(jnp.array([1.0, 3.0]))
+        awaited(jax.vmap(f), jnp.array([1.0, 3.0]))
     assert (3.0 in stored(path)) == batched
 
 
