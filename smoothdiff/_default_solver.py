@@ -72,7 +72,8 @@ def default_solver(
     # with more parameters a quadratic model takes too many evaluations
     if NewtonCG(1.0).sizes(y) is not None:
         return NewtonCG(sigma)
-    return FirstOrder(optax.chain(optax.scale_by_adam(), _in_sigmas(sigma)), sigma)
+    optim = optax.chain(optax.scale_by_adam(), _in_sigmas(sigma))
+    return FirstOrder(optim, sigma, adaptive=not callable(sigma))
 
 
 def _usual(y: PyTree[Array], bounds: tuple[PyTree, PyTree] | None, share: float) -> PyTree[Array]:

@@ -59,10 +59,11 @@ def minimise(
     $$ \min_y F(y), \qquad F(y) = \mathbb{E}_z[f(y + \sigma z, \text{args})] $$
 
     The default solver is `NewtonCG(sigma)`, and from 100 parameters on `FirstOrder` with Adam,
-    whose steps are 0.15 sigma. The default sigma is a fifth of a parameter's range. A parameter
-    without one gets a fifth of the largest number of its leaf of y0, or 0.2 if that is zero. For
-    `NewtonCG` the order of magnitude will do. If all of its first points have the same value, it
-    looks up to a thousand sigma away; where it finds a change, it takes the first points again.
+    whose steps are 0.15 sigma, `adaptive` unless sigma is a schedule. The default sigma is a fifth
+    of a parameter's range. A parameter without one gets a fifth of the largest number of its leaf
+    of y0, or 0.2 if that is zero. For both the order of magnitude will do. If all first points of
+    `NewtonCG` have the same value, it looks up to a thousand sigma away; where it finds a change,
+    it takes the first points again.
 
     But for rounding, the iterates are those of `optimistix.minimise(fun, solver, y0, args,
     options={"key": key})`, with `"bounds": bounds` in the options if there are any.

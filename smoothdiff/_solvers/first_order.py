@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from smoothdiff._baselines import AbstractBaseline
 from smoothdiff._named_baselines import as_baseline
-from smoothdiff._params import take_apart
+from smoothdiff._params import Params, take_apart
 from smoothdiff._samplers import AbstractSampler, Gaussian
 from smoothdiff._seen import watched
 from smoothdiff._smooth import smooth
@@ -30,6 +30,7 @@ from smoothdiff._solvers._base import (
     unless_failed,
 )
 from smoothdiff._solvers._judgement import judged, judging, one_by_one
+from smoothdiff._solvers._path_length import PathLength, steps_scaled
 from smoothdiff._solvers._random_numbers import in_step
 
 # so many small updates in a row count as convergence: under noise a single one is luck
@@ -41,7 +42,10 @@ _NEWEST = 0.1
 
 
 class FirstOrderState(eqx.Module):
-    """The state of `FirstOrder`: with an average of the iterates and counts of steps in a row."""
+    """The state of `FirstOrder`: with an average of the iterates and counts of steps in a row.
+
+    `length` is None unless the solver is adaptive.
+    """
 
     progress: Progress
     opt_state: PyTree
@@ -49,6 +53,7 @@ class FirstOrderState(eqx.Module):
     # small updates, and batches that were lost
     stall: Int[Array, ""]
     lost: Int[Array, ""]
+    length: PathLength | None
 
 
 class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
@@ -71,6 +76,13 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
         num_samples: evaluations a step. The default is small: many rough steps beat few good ones
             at the same number of evaluations.
         sampler: where to sample.
+        adaptive: whether sigma and the updates are multiplied by $s_t$, one number for all
+            parameters, which begins at one and is multiplied by $e^{c (\|p\|^2 / n - 1.2) / 2}$.
+            The path $p \leftarrow (1 - c) p + \sqrt{c (2 - c)} \, d$ adds up the directions d of
+            gradients, in sigmas and as long as $\sqrt n$, over n evaluations, c = `num_samples` /
+            n, or ten steps. Where they agree it is longer than where they are random, and steps
+            grow, up to a thousand times; where they oscillate or are noise, they shrink. Where all
+            samples of a step are the same, as on a plateau, they grow.
         baseline: what to subtract, as for `smooth`.
         batch_size: evaluate at most so many samples at a time, as for `smooth`.
         nonfinite: "propagate" or "drop" samples that are NaN or infinite, as for `smooth`. A step
@@ -97,11 +109,14 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
         [1, 1]
 
     Source: Plateau-reduced Differentiable Path Tracing (Fischer and Ritschel), which uses Adam.
+    `adaptive`: cumulative step-size adaptation (Hansen and Ostermeier 2001), here of the directions
+    of sampled gradients, whatever `optim` makes of them.
     """
 
     optim: optax.GradientTransformation
     sigma: PyTree
     _: KW_ONLY
+    adaptive: bool = False
     num_samples: int = 8
     sampler: AbstractSampler = Gaussian(antithetic=True)
     baseline: str | AbstractBaseline = "mean"
@@ -126,10 +141,19 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
         """Those that judge the start, the last iterate, the average and the best estimate."""
         return judging(self.num_samples, new=4)
 
-    def _estimator(self, fn, args, step, options) -> Callable:
-        """`y -> value, (stderr, seen)`, differentiable, with the key and the sigma of a step."""
+    def _scaled(self, y, state, options) -> tuple[Params, Array | None, PyTree]:
+        """The parameters with the sigma of a step, what that is multiplied by, and the product."""
+        sigma = sigma_at(self.sigma, state.progress.step)
+        params = take_apart(y, sigma, read_options(options)[1])
+        if state.length is None:
+            return params, None, sigma
+        scale = state.length.within(params)
+        with promotion():
+            return params, scale, jax.tree.map(lambda s: s * scale, sigma)
+
+    def _estimator(self, fn, args, step, options, sigma: PyTree) -> Callable:
+        """`y -> value, (stderr, seen)`, differentiable, with the key of a step."""
         key, bounds = read_options(options)
-        sigma = sigma_at(self.sigma, step)
 
         def estimate(y):
             # one pair or frame alone has no standard error, but it does have a gradient
@@ -158,18 +182,23 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
         """Checks what can be looked at; evaluates nothing."""
         _, bounds = read_options(options)
         step = jnp.asarray(0, jnp.int32)
-        take_apart(y, sigma_at(self.sigma, step), bounds)
-        return FirstOrderState(Progress.start(y, f_struct.dtype), self.optim.init(y), y, step, step)
+        params = take_apart(y, sigma_at(self.sigma, step), bounds)
+        length = PathLength.start(params) if self.adaptive else None
+        progress = Progress.start(y, f_struct.dtype)
+        return FirstOrderState(progress, self.optim.init(y), y, step, step, length)
 
     def step(self, fn, y, args, options, state: FirstOrderState, tags):
         """One batch, one update."""
         progress = state.progress
         args = in_step(args, options, progress.step)
-        estimate = self._estimator(fn, args, progress.step, options)
+        params, scale, sigma = self._scaled(y, state, options)
+        estimate = self._estimator(fn, args, progress.step, options, sigma)
         (fun, (stderr, seen)), grad = jax.value_and_grad(estimate, has_aux=True)(y)
         optim = optax.with_extra_args_support(self.optim)
         with promotion():
             updates, opt_state = optim.update(grad, state.opt_state, y, value=fun, grad=grad)
+            if scale is not None:
+                updates = steps_scaled(updates, params, scale)
             new_y = optax.apply_updates(y, updates)
         new_y = project(new_y, read_options(options)[1])
         share = jnp.maximum(_NEWEST, 1 / (progress.step + 1).astype(fun.dtype))
@@ -180,16 +209,17 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
             moved, size = self.norm(jax.tree.map(jnp.subtract, new_y, y)), self.norm(y)
             stall = jnp.where(moved < self.atol + self.rtol * size, state.stall + 1, 0)
         finite = all_finite((fun, grad, new_y))
-        new_y, opt_state, average = unless_failed(
-            finite, (new_y, opt_state, average), (y, state.opt_state, state.average)
+        length = state.length and state.length.after(params, grad, self.num_samples)
+        old = y, state.opt_state, state.average, state.length
+        new_y, opt_state, average, length = unless_failed(
+            finite, (new_y, opt_state, average, length), old
         )
-        sigma = sigma_at(self.sigma, progress.step)
         lost = jnp.where(finite, 0, state.lost + 1)
         stall = jnp.where(finite, stall, state.stall)
         again = (lost <= _TRIES) if self.nonfinite == "drop" else finite
         progress = progress.after(y, fun, stderr, sigma, self.num_samples, finite | again, seen)
         # the function was never evaluated at y itself, so its aux is that of a sample near y
-        return new_y, FirstOrderState(progress, opt_state, average, stall, lost), seen.aux
+        return new_y, FirstOrderState(progress, opt_state, average, stall, lost, length), seen.aux
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """After small updates in a row, or a failed step."""
@@ -199,7 +229,8 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
         """Judges all that was seen, the start, the last iterate, the average, the best estimate."""
         progress = state.progress
         numbers = in_step(args, options, progress.step)
-        estimate = self._estimator(fn, numbers, progress.step, options)
+        *_, sigma = self._scaled(y, state, options)
+        estimate = self._estimator(fn, numbers, progress.step, options, sigma)
 
         def smoothed(y):
             fun, (stderr, seen) = estimate(y)
