@@ -28,15 +28,26 @@ def test_the_finest_level_is_the_picture_minus_the_photograph():
     np.testing.assert_allclose(finest.fun(y, None), render(y) - seen, atol=1e-6)
 
 
-def test_coarse_levels_have_fewer_pixels_samples_and_bounces():
+def test_coarse_levels_have_fewer_pixels_and_samples():
     seen = np.zeros((64, 128, 3), np.float32)
-    levels = mitsuba.levels(scene(), "ball.translate", seen, spp=64, integrator=PATH)
+    levels = mitsuba.levels(scene(), "ball.translate", seen, spp=64)
     y = jnp.zeros(3)
     shapes = [jax.eval_shape(level.fun, y, None).shape for level in levels]
     assert shapes == [(8, 16, 3), (16, 32, 3), (32, 64, 3), (64, 128, 3)]
-    samples = [8 * 16 * 9, 16 * 32 * 4, 32 * 64 * 16, 64 * 128 * 64]
-    costs = [3 * samples[0], 3 * samples[1], 8 * samples[2], 8 * samples[3]]
+    costs = [8 * 16 * 9, 16 * 32 * 4, 32 * 64 * 16, 64 * 128 * 64]
     assert [level.cost for level in levels] == costs
+
+
+def test_light_bounces_as_often_on_all_levels():
+    # within a white ball that shines, each bounce adds nine tenths of the one before
+    white = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.9}}
+    lamp = {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}
+    ball = {"type": "sphere", "radius": 5.0, "flip_normals": True, "bsdf": white, "lamp": lamp}
+    inside = {"type": "scene", "integrator": PATH, "ball": ball, "camera": {"type": "perspective"}}
+    levels = mitsuba.levels(inside, "ball.translate", np.zeros((32, 32, 3), np.float32), spp=16)
+    lit = [float(jnp.mean(level.fun(jnp.zeros(3), None))) for level in levels]
+    light = sum(0.9**bounce for bounce in range(PATH["max_depth"]))
+    np.testing.assert_allclose(lit, [4 * light, 2 * light, light], rtol=0.01)
 
 
 def test_residuals_of_all_levels_are_about_as_large():

@@ -12,9 +12,8 @@ from smoothdiff.renderers._mitsuba_renderer import renderer
 
 # fewer samples of a picture than this cost what the call costs
 _SAMPLES = 1024
-# the fewest samples of a pixel, whose edges would else jump, and bounces of light, of levels that
-# are coarser than the two finest
-_FEW, _BOUNCES = 4, 3
+# the fewest samples of a pixel, whose edges would else jump
+_FEW = 4
 
 
 def levels(
@@ -23,7 +22,6 @@ def levels(
     photo: Float[np.ndarray | Array, "height width 3"],
     *,
     spp: int,
-    integrator: dict[str, Any] | None = None,
     inputs: Callable[[PyTree], Any] = lambda y: y,
     coarsest: int = 8,
     **options: Any,
@@ -34,9 +32,8 @@ def levels(
 
     The finest level has the pixels of the photograph, with `spp` samples each. Each coarser level
     has half as many pixels along a side, and a quarter of the samples of a pixel, but no fewer than
-    4 for a pixel and 1,024 for the picture. Its photograph has the means of the pixels. Where the
-    integrator has a `max_depth`, the two finest levels keep it, and the others have at most 3. The
-    cost of a level is its number of samples, times the depth.
+    4 for a pixel and 1,024 for the picture. Its photograph has the means of the pixels. The
+    integrator stays the same, and the cost of a level is its number of samples.
 
     Args:
         scene: as for `renderer`; the path of a file or a dict, as each level loads its own.
@@ -44,11 +41,9 @@ def levels(
         photo: the photograph, linear RGB, of any size. Halves of it must be whole numbers of
             pixels, so a power of two allows most levels.
         spp: samples of a pixel at the finest level.
-        integrator: a dict as for `mitsuba.load_dict`. None: that of the scene, which must then be a
-            dict itself.
         inputs: a function from y to what `renderer` takes, by default y itself.
         coarsest: the least number of pixels along the shorter side.
-        **options: as for `renderer`: `axis`, `sensor`, `variant`, `seed`, `noise`.
+        **options: as for `renderer`: `integrator`, `axis`, `sensor`, `variant`, `seed`, `noise`.
 
     Returns:
         The levels, the coarsest first. Their functions are those of y that `least_squares` wants,
@@ -72,8 +67,6 @@ def levels(
     photo = np.asarray(photo, np.float32)
     if photo.ndim != 3 or photo.shape[2] != 3:
         raise ValueError(f"photo must be of shape (height, width, 3), not {photo.shape}")
-    if integrator is None and isinstance(scene, dict):
-        integrator = scene.get("integrator")
 
     def level(halved: int) -> Level:
         factor = 2**halved
@@ -81,16 +74,13 @@ def levels(
         seen = photo.reshape(height, factor, width, factor, 3).mean(axis=(1, 3))
         samples = max(spp // 4**halved, min(spp, _FEW), math.ceil(_SAMPLES / (height * width)))
         samples = math.ceil(math.sqrt(samples)) ** 2  # as stratified samplers want it
-        light, depth = _shallow(integrator, deep=halved < 2)
-        render = renderer(
-            scene, params, resolution=(height, width), spp=samples, integrator=light, **options
-        )
+        render = renderer(scene, params, resolution=(height, width), spp=samples, **options)
 
         def residuals(y: PyTree, args: Any, key: Array | None = None) -> Array:
             # as long as those of the finest level, but for what is seen there alone
             return factor * (render(inputs(y), key) - seen)
 
-        return Level(residuals, float(height * width * samples * depth))
+        return Level(residuals, float(height * width * samples))
 
     count = 0
     while all(side % 2 ** (count + 1) == 0 for side in photo.shape[:2]) and (
@@ -98,11 +88,3 @@ def levels(
     ):
         count += 1
     return [level(halved) for halved in range(count, -1, -1)]
-
-
-def _shallow(integrator: dict[str, Any] | None, deep: bool) -> tuple[dict[str, Any] | None, int]:
-    """The integrator of a level, and how often light bounces."""
-    depth = (integrator or {}).get("max_depth", 1)
-    if deep or 0 <= depth <= _BOUNCES:
-        return integrator, depth if depth > 0 else 2 * _BOUNCES
-    return {**(integrator or {}), "max_depth": _BOUNCES}, _BOUNCES
