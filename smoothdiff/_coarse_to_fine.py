@@ -115,7 +115,7 @@ def coarse_to_fine(
     Far from the answer a cheap version says as much as a dear one, and a picture of few pixels has
     fewer local minima. The search leaves a level that has little more to tell: one whose lowest
     value has fallen by less than a tenth during its last evaluations, as many as cost what the
-    first n + 1 of the next level do (at least 2 (n + 1), at most 20 (n + 1)). The next level begins
+    first n + 1 of the next level do (at least 6 (n + 1), at most 20 (n + 1)). The next level begins
     at the best point. Its sigma is smaller, because its error is: the width of a pixel and the
     noise of random samples both fall with the root of their cost. The finest level ends as any
     search does.
