@@ -34,7 +34,14 @@ def test_coarse_levels_have_fewer_pixels_and_samples():
     y = jnp.zeros(3)
     shapes = [jax.eval_shape(level.fun, y, None).shape for level in levels]
     assert shapes == [(8, 16, 3), (16, 32, 3), (32, 64, 3), (64, 128, 3)]
-    costs = [8 * 16 * 9, 16 * 32 * 4, 32 * 64 * 16, 64 * 128 * 64]
+    costs = [8 * 16 * 16, 16 * 32 * 16, 32 * 64 * 16, 64 * 128 * 64]
+    assert [level.cost for level in levels] == costs
+
+
+def test_levels_of_few_samples_keep_them_down_to_a_thousand():
+    seen = np.zeros((64, 128, 3), np.float32)
+    levels = mitsuba.levels(scene(), "ball.translate", seen, spp=4)
+    costs = [8 * 16 * 9, 16 * 32 * 4, 32 * 64 * 4, 64 * 128 * 4]
     assert [level.cost for level in levels] == costs
 
 

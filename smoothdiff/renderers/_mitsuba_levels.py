@@ -12,8 +12,8 @@ from smoothdiff.renderers._mitsuba_renderer import renderer
 
 # fewer samples of a picture than this cost what the call costs
 _SAMPLES = 1024
-# the fewest samples of a pixel, whose edges would else jump
-_FEW = 4
+# the fewest samples of a pixel: their noise must not hide what differs between two points
+_FEW = 16
 
 
 def levels(
@@ -32,8 +32,8 @@ def levels(
 
     The finest level has the pixels of the photograph, with `spp` samples each. Each coarser level
     has half as many pixels along a side, and a quarter of the samples of a pixel, but no fewer than
-    4 for a pixel and 1,024 for the picture. Its photograph has the means of the pixels. The
-    integrator stays the same, and the cost of a level is its number of samples.
+    16 for a pixel (or `spp`, if less) and 1,024 for the picture. Its photograph has the means of
+    the pixels. The integrator stays the same, and the cost of a level is its number of samples.
 
     Args:
         scene: as for `renderer`; the path of a file or a dict, as each level loads its own.
@@ -60,7 +60,7 @@ def levels(
         >>> photo = np.ones((32, 32, 3), np.float32)
         >>> steps = mitsuba.levels(scene, "ball.translate", photo, spp=16)
         >>> [level.cost for level in steps]
-        [1024.0, 1024.0, 16384.0]
+        [1024.0, 4096.0, 16384.0]
 
     Source: own, as `coarse_to_fine`.
     """
