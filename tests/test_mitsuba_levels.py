@@ -14,9 +14,10 @@ from tests.test_mitsuba import scene
 PATH = {"type": "path", "max_depth": 8}
 
 
-def photo(resolution, spp=16, **changes):
+def photo(resolution, spp=16, seed=0, **changes):
     mi.set_variant("scalar_rgb")
-    render = mitsuba.renderer(scene(**changes), "ball.translate", resolution=resolution, spp=spp)
+    options = {"resolution": resolution, "spp": spp, "seed": seed}
+    render = mitsuba.renderer(scene(**changes), "ball.translate", **options)
     return np.asarray(render(jnp.array([-0.5, 0.2, 0.3])))
 
 
@@ -76,14 +77,18 @@ def test_inputs_are_a_function_of_y():
 
 @pytest.mark.slow
 def test_a_place_is_found_for_less_than_the_finest_level_alone():
-    seen = photo(64)
+    """In the mean of four keys, of a photograph whose noise is its own."""
+    seen = photo(64, seed=1)
     levels = mitsuba.levels(scene(), "ball.translate", seen, spp=16)
-    options = {"key": jax.random.key(0), "bounds": (-1.0, 1.0)}
-    start = jnp.array([0.3, -0.2, 0.0])
-    found = sd.coarse_to_fine(sd.least_squares, levels, start, **options)
-    np.testing.assert_allclose(found.y, [-0.5, 0.2, 0.3], atol=0.03)
-    alone = sd.least_squares(levels[-1].fun, start, **options)
-    assert found.cost < alone.evaluations
+    costs, alone = [], []
+    for seed in range(4):
+        options = {"key": jax.random.key(seed), "bounds": (-1.0, 1.0)}
+        start = jnp.array([0.3, -0.2, 0.0])
+        found = sd.coarse_to_fine(sd.least_squares, levels, start, **options)
+        np.testing.assert_allclose(found.y, [-0.5, 0.2, 0.3], atol=0.03)
+        costs.append(found.cost)
+        alone.append(sd.least_squares(levels[-1].fun, start, **options).evaluations)
+    assert np.mean(costs) < 0.8 * np.mean(alone), (costs, alone)
 
 
 @pytest.mark.parametrize("shape", [(8, 8), (8, 8, 1)])
