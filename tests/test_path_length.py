@@ -94,6 +94,15 @@ def test_slopes_that_lead_out_of_the_bounds_do_not_count():
     assert start.after(params, jnp.array([-5.0, 0.0, 7.0, 0.0]), 2).scale < 1
 
 
+def test_sigma_grows_to_a_fifth_of_a_range_at_most():
+    """Or stays what it was, if that is more."""
+    for sigma, most in ((0.01, 40), (0.4, 1), (1.0, 1)):
+        params = take_apart(jnp.zeros(3), sigma, (-1.0, jnp.array([1.0, 9.0, jnp.inf])))
+        _, scale = scales(jnp.ones((200, 3)), params, 3)
+        np.testing.assert_allclose(jnp.max(scale), most, rtol=0.06)
+        assert PathLength(scale[-1], params.theta).within(params) <= 1.0001 * most
+
+
 def test_equal_samples_make_it_longer_and_leave_the_path():
     params = take_apart(jnp.zeros(4), 1.0, None)
     before = PathLength.start(params).after(params, jnp.ones(4), 2)
@@ -143,6 +152,7 @@ def test_leaves_without_a_sigma_take_the_steps_of_the_transformation():
     state = eqx.tree_at(lambda s: s.length.scale, state, jnp.asarray(0.5))
     y, after, _ = solver.step(fn, y0, None, options, state, frozenset())
     np.testing.assert_allclose(y["b"], 1 - 0.01, rtol=1e-6)
+    assert after.length is not None
     assert after.length.path.shape == (3,)
     assert after.progress.sigma == jnp.float32(0.15)
     same = eqx.tree_at(lambda s: s.length.scale, state, jnp.asarray(1.0))

@@ -8,13 +8,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from smoothdiff._params import Params
+from smoothdiff._spaces import SIGMA
 
 # directions without a memory make a path of length one in each parameter, directions that are all
 # the same one of two: in between steps are right
 _RIGHT = 1.2
 # the path is of the last n evaluations, and no shorter than what Adam remembers
 _SHORTEST = 0.1
-# the largest scale; the smallest leaves sigma so many spacings of its parameter
+# the largest scale without bounds; the smallest leaves sigma so many spacings of its parameter
 _MOST, _SPACINGS = 1e3, 8
 
 
@@ -31,12 +32,17 @@ class PathLength(eqx.Module):
         return PathLength(jnp.ones((), theta.dtype), jnp.zeros_like(theta))
 
     def within(self, params: Params) -> Float[Array, ""]:
-        """The scale, so that samples around these parameters are still other points."""
+        """The scale, so that samples around these parameters are other points, and few clamped."""
         layout = params.layout
         kept = zip(layout.dtypes, layout.smoothed, strict=True)
         spacing = max(float(jnp.finfo(dtype).eps) for dtype, smoothed in kept if smoothed)
         least = _SPACINGS * spacing * jnp.max(jnp.abs(params.theta) / params.sigma)
-        return jnp.clip(self.scale, jnp.minimum(least, _MOST), _MOST)
+        most = jnp.asarray(_MOST, self.scale.dtype)
+        if params.low is not None and params.high is not None:
+            # wider samples are clamped so often that their gradients agree on the bounds alone
+            usual = jnp.min(SIGMA * (params.high - params.low) / params.sigma)
+            most = jnp.clip(usual, 1, most)
+        return jnp.clip(self.scale, jnp.minimum(least, most), most)
 
     def after(self, params: Params, grad: PyTree[Array], evaluations: int) -> "PathLength":
         """The next one, when so many evaluations gave this gradient at `params`."""

@@ -81,8 +81,9 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
             The path $p \leftarrow (1 - c) p + \sqrt{c (2 - c)} \, d$ adds up the directions d of
             gradients, in sigmas and as long as $\sqrt n$, over n evaluations, c = `num_samples` /
             n, or ten steps. Where they agree it is longer than where they are random, and steps
-            grow, up to a thousand times; where they oscillate or are noise, they shrink. Where all
-            samples of a step are the same, as on a plateau, they grow.
+            grow, up to a thousand times; within bounds until sigma is a fifth of a range. Where
+            they oscillate or are noise, steps shrink. Where all samples of a step are the same, as
+            on a plateau, they grow.
         baseline: what to subtract, as for `smooth`.
         batch_size: evaluate at most so many samples at a time, as for `smooth`.
         nonfinite: "propagate" or "drop" samples that are NaN or infinite, as for `smooth`. A step

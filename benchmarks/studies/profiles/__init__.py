@@ -2,7 +2,8 @@
 
 Methods see residuals or numbers, exact, with noise, or rounded; the exact values are scored. A
 budget counts in units of n + 1 evaluations, for BBOB of n. `python -m benchmarks profiles bbob5`
-runs one of the sets, residuals, scalars, and bbob5, bbob10 and bbob20 by the number of parameters.
+runs one of the sets: residuals, scalars, bbob5, bbob10, bbob20 and, of COCO's large-scale suite,
+bbob160, by the number of parameters.
 """
 
 import re

@@ -1,4 +1,4 @@
-"""Ours: `GaussNewton` on residuals, `NewtonCG` on numbers, both through a black box.
+"""Ours: `GaussNewton` on residuals, `NewtonCG` or the default on numbers, through a black box.
 
 There is one black box for all functions of a shape, so that a solver is compiled once for each.
 """
@@ -23,12 +23,16 @@ SOURCE = "".join(path.read_text() for path in FILES)
 
 def gauss_newton(seen: Seen) -> None:
     solver = sd.GaussNewton(jnp.asarray(seen.case.width), nonfinite="drop")
-    _run(sd.least_squares, seen, solver)
+    _run(sd.least_squares, seen, solver, max_steps=ENDLESS)
 
 
 def newton_cg(seen: Seen) -> None:
     solver = sd.NewtonCG(jnp.asarray(seen.case.width), nonfinite="drop", restarts=100)
-    _run(sd.minimise, seen, solver)
+    _run(sd.minimise, seen, solver, max_steps=ENDLESS)
+
+
+def shortest_call(seen: Seen) -> None:
+    _run(sd.minimise, seen, None, max_evaluations=seen.budget)
 
 
 @cache
@@ -44,12 +48,12 @@ def _black_box(shape: tuple[int, ...]) -> SimpleNamespace:
     return box
 
 
-def _run(minimise: Any, seen: Seen, solver: Any) -> None:
+def _run(minimise: Any, seen: Seen, solver: Any, **limits: int) -> None:
     box, start = _black_box(seen.at_start.shape), jnp.asarray(seen.case.start)
     box.current = seen
-    options = {"key": jax.random.key(SEED), "bounds": seen.case.bounds, "max_steps": ENDLESS}
+    options = {"key": jax.random.key(SEED), "bounds": seen.case.bounds}
     try:
-        result = minimise(box.fun, start, solver=solver, **options)
+        result = minimise(box.fun, start, solver=solver, **options, **limits)
     except sd.MinimiseError:
         if seen.count < seen.budget:
             raise
@@ -61,4 +65,5 @@ def _run(minimise: Any, seen: Seen, solver: Any) -> None:
 METHODS = {
     "gauss_newton": Method("Gauss-Newton (ours)", True, gauss_newton, SOURCE),
     "newton_cg": Method("Newton-CG (ours)", False, newton_cg, SOURCE),
+    "shortest_call": Method("shortest call (ours)", False, shortest_call, SOURCE),
 }

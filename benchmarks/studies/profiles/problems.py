@@ -91,9 +91,28 @@ def bbob(n: int, full: bool) -> Iterator[Panel]:
     yield Panel("bbob", f"BBOB, {n}-D", cases, budgets, more=0, targets=TARGETS)
 
 
+def large(n: int, full: bool) -> Iterator[Panel]:
+    """The 24 functions of COCO's large-scale suite, whose rotations are cheap."""
+    if not full:
+        return
+    cocoex = package("cocoex", "coco-experiment")
+    suite = cocoex.Suite("bbob-largescale", "", f"dimensions:{n} instance_indices:1")
+    cases = []
+    for number in range(1, 25):
+        problem = suite.get_problem_by_function_dimension_instance(number, n, 1)
+        # the lowest value is that of the function and the instance in any dimension
+        best = cocoex.BareProblem("bbob", number, 2, 1).best_value()
+        cases.append(_case(problem, best, number, n, 1))
+    yield Panel(f"bbob{n}", f"BBOB, {n}-D", cases, (10, 30), more=0, targets=TARGETS)
+
+
 def _bbob(cocoex: ModuleType, number: int, n: int, instance: int) -> Case:
-    problem, box = cocoex.BareProblem("bbob", number, n, instance), np.full(n, BOX)
-    best = problem.best_value()
+    problem = cocoex.BareProblem("bbob", number, n, instance)
+    return _case(problem, problem.best_value(), number, n, instance)
+
+
+def _case(problem: Any, best: float, number: int, n: int, instance: int) -> Case:
+    box = np.full(n, BOX)
     start = np.random.default_rng((number, n, instance)).uniform(-BOX, BOX, n)
     above = lambda x: problem(x) - best
     return Case(f"f{number}-{n}d-{instance}", above, start, BOX_WIDTH, (-box, box), 0.0)
@@ -169,3 +188,4 @@ def _sif2jax() -> ModuleType:
 SETS = {"residuals": residuals, "scalars": scalars} | {
     f"bbob{n}": partial(bbob, n) for n in (5, 10, 20)
 }
+SETS["bbob160"] = partial(large, 160)
