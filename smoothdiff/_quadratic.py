@@ -150,7 +150,7 @@ class QuadraticModel(eqx.Module):
     def __call__(self, step: PyTree) -> Array:
         """The model's value at the parameters plus `step`."""
         half = jax.tree.map(lambda g, h: g + h / 2, self.grad, self.hessian.mv(step))
-        dots = jax.tree.map(lambda a, b: dot(a.reshape(-1), b.reshape(-1)), half, step)
+        dots = jax.tree.map(lambda a, b: dot(jnp.ravel(a), jnp.ravel(b)), half, step)
         return self.value + _sum(jax.tree.leaves(dots), self.value.dtype)
 
 

@@ -336,6 +336,7 @@ def test_the_residuals_of_a_jump_are_left_by_wide_rounds():
 
 @pytest.mark.parametrize("beyond", [np.nan, np.inf, 1e22])
 def test_the_end_of_a_step_may_be_anything(beyond):
+    """The budget ends before float32 does: from the 18th evaluation on rounding decides."""
     result = solve(wall, (6, 1), [beyond], sigma=1.0, watched=True, max_evaluations=18)
     assert np.max(EVALUATED) > 20.5
     assert result.reason == "max_evaluations"

@@ -96,9 +96,11 @@ def test_slopes_that_lead_out_of_the_bounds_do_not_count():
 
 def test_sigma_grows_to_a_fifth_of_a_range_at_most():
     """Or stays what it was, if that is more."""
+    # one is free, and one fixed
+    bounds = jnp.array([-1.0, -1.0, -1.0, 0.0]), jnp.array([1.0, 9.0, jnp.inf, 0.0])
     for sigma, most in ((0.01, 40), (0.4, 1), (1.0, 1)):
-        params = take_apart(jnp.zeros(3), sigma, (-1.0, jnp.array([1.0, 9.0, jnp.inf])))
-        _, scale = scales(jnp.ones((200, 3)), params, 3)
+        params = take_apart(jnp.zeros(4), sigma, bounds)
+        _, scale = scales(jnp.ones((200, 4)), params, 4)
         np.testing.assert_allclose(jnp.max(scale), most, rtol=0.06)
         assert PathLength(scale[-1], params.theta).within(params) <= 1.0001 * most
 
@@ -132,12 +134,41 @@ def test_a_plateau_wider_than_sigma_is_left():
     assert far(solution.value, None) == 0
 
 
-def test_it_goes_down_to_rounding_and_stays_there(dtype):
+@pytest.mark.parametrize("target", [3.0, 0.0])
+def test_it_goes_down_to_rounding_and_stays_there(target, dtype):
     """No sample may be the parameter itself, which would be refused."""
-    fun = lambda y, args: jnp.sum(jnp.abs(y - 3))
+    fun = lambda y, args: jnp.sum(jnp.abs(y - target))
     solution = solve(fun, jnp.ones(2, dtype), adam(1.0), 3000)
     assert solution.result == optx.RESULTS.nonlinear_max_steps_reached
-    np.testing.assert_allclose(solution.value, 3, rtol=20 * float(jnp.finfo(dtype).eps))
+    atol = 1e-6 + 60 * float(jnp.finfo(dtype).eps)
+    np.testing.assert_allclose(solution.value, target, rtol=0, atol=atol)
+
+
+def test_a_corner_shrinks_steps_to_a_millionth_at_most():
+    params = take_apart(jnp.zeros(3), 1.0, (0.0, 1.0))
+    length, _ = scales(jnp.ones((2000, 3)), params, 3)
+    np.testing.assert_allclose(length.within(params), 1e-6, rtol=1e-6)
+
+
+def test_a_step_that_fails_is_followed_by_a_narrower_one():
+    """Growing has led to where the function is not defined."""
+    fun = lambda y, args: jnp.where(jnp.max(jnp.abs(y)) > 9, jnp.nan, jnp.sum((y - 5) ** 2))
+    solver = adam(8.0, nonfinite="drop")
+    solution = solve(fun, jnp.zeros(2), solver, 200)
+    assert solution.result == optx.RESULTS.nonlinear_max_steps_reached
+    np.testing.assert_allclose(solution.value, 5, atol=0.1)
+
+
+def test_a_schedule_is_multiplied_as_well():
+    fun = lambda y, args: jnp.sum(y)
+    run = lambda sigma: sd.minimise(
+        fun, jnp.zeros(30), key=KEY, solver=sd.FirstOrder(optax.sgd(0.0), sigma, adaptive=True)
+    )
+    constant, falling = run(1.0).history, run(lambda step: 1 / (1 + step)).history
+    for step in (0, 10, 100):
+        np.testing.assert_allclose(
+            falling[step].sigma * (1 + step), constant[step].sigma, rtol=1e-3
+        )
 
 
 def test_leaves_without_a_sigma_take_the_steps_of_the_transformation():

@@ -110,6 +110,8 @@ def test_calling_the_model_gives_its_quadratic(model):
     want = model.value + g @ p + p @ h @ p / 2
     assert_same(model(V), want, scale=10)
     assert_same(model(jax.tree.map(jnp.zeros_like, X)), model.value)
+    # numbers of Python as well
+    assert_same(model({**V, "b": 0.5}), want, scale=10)
     slope = jax.jit(jax.grad(lambda step: model(step)))(V)
     assert_same(flat(slope), g + h @ p, scale=10)
 

@@ -15,8 +15,8 @@ from smoothdiff._spaces import SIGMA
 _RIGHT = 1.2
 # the path is of the last n evaluations, and no shorter than what Adam remembers
 _SHORTEST = 0.1
-# the largest scale without bounds; the smallest leaves sigma so many spacings of its parameter
-_MOST, _SPACINGS = 1e3, 8
+# the largest scale without bounds, the smallest, and the least sigma in spacings of its parameter
+_MOST, _LEAST, _SPACINGS = 1e3, 1e-6, 8
 
 
 class PathLength(eqx.Module):
@@ -37,10 +37,12 @@ class PathLength(eqx.Module):
         kept = zip(layout.dtypes, layout.smoothed, strict=True)
         spacing = max(float(jnp.finfo(dtype).eps) for dtype, smoothed in kept if smoothed)
         least = _SPACINGS * spacing * jnp.max(jnp.abs(params.theta) / params.sigma)
+        least = jnp.maximum(least, _LEAST)
         most = jnp.asarray(_MOST, self.scale.dtype)
         if params.low is not None and params.high is not None:
             # wider samples are clamped so often that their gradients agree on the bounds alone
-            usual = jnp.min(SIGMA * (params.high - params.low) / params.sigma)
+            span = params.high - params.low
+            usual = jnp.min(jnp.where(span > 0, SIGMA * span / params.sigma, jnp.inf))
             most = jnp.clip(usual, 1, most)
         return jnp.clip(self.scale, jnp.minimum(least, most), most)
 
@@ -62,6 +64,10 @@ class PathLength(eqx.Module):
         # samples that are all the same say only that others are farther away
         longer, path = jnp.where(size > 0, longer, 1), jnp.where(size > 0, path, self.path)
         return PathLength(self.within(params) * jnp.exp(rate / 2 * longer), path)
+
+    def failed(self) -> "PathLength":
+        """The next one after a step whose samples were not finite: nearer ones may be."""
+        return PathLength(self.scale / 2, self.path)
 
 
 def steps_scaled(updates: PyTree[Array], params: Params, scale: Float[Array, ""]) -> PyTree[Array]:

@@ -73,17 +73,19 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
         sigma: the smoothing width in the units of the parameters: a number, a pytree like the
             parameters (None in a leaf: not smoothed, differentiated by AD), or an optax schedule,
             a function from the number of the step to a number.
+        adaptive: whether sigma, a schedule's as well, and the updates are multiplied by one number,
+            which begins at one, and in each step by $e^{c l / 2}$, where l is
+            $\|p\|^2 / n - 1.2$, but from -1 to 1. The path
+            $p \leftarrow (1 - c) p + \sqrt{c (2 - c)} \, d$ adds up the directions d of gradients,
+            in sigmas and as long as $\sqrt n$, over about n evaluations: c is `num_samples` / n, at
+            most 0.1. Where they agree it is longer than where they are random, and steps grow, up
+            to a thousand times; within bounds until sigma is a fifth of the least range. Where they
+            oscillate or are noise, steps shrink, to a millionth at most. Directions that lead out
+            of the bounds do not count. Steps grow where the gradient is zero, as with the baseline
+            "mean" on a plateau; after a step that has failed they are half as long.
         num_samples: evaluations a step. The default is small: many rough steps beat few good ones
             at the same number of evaluations.
         sampler: where to sample.
-        adaptive: whether sigma and the updates are multiplied by $s_t$, one number for all
-            parameters, which begins at one and is multiplied by $e^{c (\|p\|^2 / n - 1.2) / 2}$.
-            The path $p \leftarrow (1 - c) p + \sqrt{c (2 - c)} \, d$ adds up the directions d of
-            gradients, in sigmas and as long as $\sqrt n$, over n evaluations, c = `num_samples` /
-            n, or ten steps. Where they agree it is longer than where they are random, and steps
-            grow, up to a thousand times; within bounds until sigma is a fifth of a range. Where
-            they oscillate or are noise, steps shrink. Where all samples of a step are the same, as
-            on a plateau, they grow.
         baseline: what to subtract, as for `smooth`.
         batch_size: evaluate at most so many samples at a time, as for `smooth`.
         nonfinite: "propagate" or "drop" samples that are NaN or infinite, as for `smooth`. A step
@@ -210,10 +212,16 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
             moved, size = self.norm(jax.tree.map(jnp.subtract, new_y, y)), self.norm(y)
             stall = jnp.where(moved < self.atol + self.rtol * size, state.stall + 1, 0)
         finite = all_finite((fun, grad, new_y))
-        length = state.length and state.length.after(params, grad, self.num_samples)
-        old = y, state.opt_state, state.average, state.length
+        length = after = None
+        if state.length is not None:
+            length, after = (
+                state.length.after(params, grad, self.num_samples),
+                state.length.failed(),
+            )
         new_y, opt_state, average, length = unless_failed(
-            finite, (new_y, opt_state, average, length), old
+            finite,
+            (new_y, opt_state, average, length),
+            (y, state.opt_state, state.average, after),
         )
         lost = jnp.where(finite, 0, state.lost + 1)
         stall = jnp.where(finite, stall, state.stall)
