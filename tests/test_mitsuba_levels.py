@@ -76,19 +76,18 @@ def test_inputs_are_a_function_of_y():
 
 
 @pytest.mark.slow
-def test_a_place_is_found_for_less_than_the_finest_level_alone():
-    """In the mean of four keys, of a photograph whose noise is its own."""
-    seen = photo(64, seed=1)
-    levels = mitsuba.levels(scene(), "ball.translate", seen, spp=16)
-    costs, alone = [], []
-    for seed in range(4):
-        options = {"key": jax.random.key(seed), "bounds": (-1.0, 1.0)}
-        start = jnp.array([0.3, -0.2, 0.0])
-        found = sd.coarse_to_fine(sd.least_squares, levels, start, **options)
-        np.testing.assert_allclose(found.y, [-0.5, 0.2, 0.3], atol=0.03)
-        costs.append(found.cost)
-        alone.append(sd.least_squares(levels[-1].fun, start, **options).evaluations)
-    assert np.mean(costs) < 0.8 * np.mean(alone), (costs, alone)
+@pytest.mark.parametrize("seed", range(3))
+def test_a_place_is_found_for_less_than_the_finest_level_alone(seed):
+    """To twice the squares that the noise of a photograph of its own leaves at the truth."""
+    truth = jnp.array([-0.5, 0.2, 0.3])
+    levels = mitsuba.levels(scene(), "ball.translate", photo(64, seed=1), spp=16)
+    finest = levels[-1].fun
+    target = float(jnp.sum(finest(truth, None) ** 2))
+    options = {"key": jax.random.key(seed), "bounds": (-1.0, 1.0), "target": target}
+    start = jnp.array([0.3, -0.2, 0.0])
+    found = sd.coarse_to_fine(sd.least_squares, levels, start, **options)
+    np.testing.assert_allclose(found.y, truth, atol=0.1)
+    assert found.cost < 0.75 * sd.least_squares(finest, start, **options).evaluations
 
 
 @pytest.mark.parametrize("shape", [(8, 8), (8, 8, 1)])
