@@ -30,15 +30,17 @@ def test_it_is_drawn_and_shown(there, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_all_calls_are_timed_where_there_is_no_accelerator(monkeypatch, tmp_path):
-    if jax.default_backend() != "cpu":
-        pytest.skip("there is one")
+def test_all_calls_are_timed_on_all_devices(monkeypatch, tmp_path):
+    """More samples than the CPU is given are for an accelerator, if there is one."""
     monkeypatch.setattr(accelerator, "TURNS", 1)
     monkeypatch.setattr(accelerator, "SAMPLES", (4, 8, 2_048))
     monkeypatch.setattr(accelerator, "PARAMETERS", (10,))
     monkeypatch.setattr(accelerator, "RESIDUALS", 20)
     monkeypatch.setattr(accelerator, "SPACE", (8, 8, 3))
     found = accelerator.measure(Namespace(), tmp_path)["calls"]
-    assert len(found) == 8
-    for call in found.values():
-        assert 0 < call["CPU"]["ms"][1] < 1e3 * call["CPU"]["first, s"]
+    there = jax.default_backend() != "cpu"
+    assert len(found) == 8 + there
+    assert sum("CPU" in call for call in found.values()) == 8
+    assert all(("accelerator" in call) is there for call in found.values())
+    for times in (times for call in found.values() for times in call.values()):
+        assert 0 < times["ms"][1] < 1e3 * times["first, s"]

@@ -339,6 +339,13 @@ def test_a_batch_of_the_wrong_length_raises():
         awaited(jax.vmap(box), jnp.arange(4.0))
 
 
+def test_on_a_cpu_the_call_itself_raises():
+    """Not only who waits for it, and not JAX's own error."""
+    box = black_box(lambda x: x[:1], SCALAR, batched=True)
+    with jax.default_device(jax.devices("cpu")[0]), pytest.raises(BlackBoxError, match="batch of"):
+        jax.vmap(box)(jnp.arange(4.0))
+
+
 def test_arguments_are_read_only():
     def host(x):
         x[0] = 1.0
