@@ -88,8 +88,8 @@ def black_box(
     Raises:
         BlackBoxError: When it runs, if `fun` fails and this is not to become a NaN. Out of a
             `jax.jit` of your own comes an error of JAX's (JaxRuntimeError or ValueError) with the
-            same message; on a GPU out of any transform, and when the numbers are waited for. What
-            was turned into NaN is logged to "smoothdiff" at level INFO.
+            same message. On a GPU that error comes out of any transform, once its result is waited
+            for. What was turned into NaN is logged to "smoothdiff" at level INFO.
         TypeError: If `fun`, `out` or `executor` is of the wrong type; later, if the function is
             differentiated or called with a typed key, or if JAX traces it before a call has found
             `out`.
