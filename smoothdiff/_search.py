@@ -20,6 +20,8 @@ from smoothdiff._unit_space import UnitSpace
 
 # a point is given out again once so many others were told, for each that is out, and some more
 _LOST, _SOME = 2, 4
+# two programs may give the same point with so many roundings between
+_ROUNDINGS = 8
 # what is asked for beyond the step of the local model: its end nearer or further, as shares
 _SHARES = (2.0, 0.5, 4.0, 0.25)
 
@@ -177,10 +179,9 @@ class Search:
     def _digested(self) -> bool:
         """Takes in what the model asks for next if that came; else what it no longer asks for."""
         points, proposal = self._steps.propose(self._y, self._state, 1)
-        unit = np.asarray(points[0]).tobytes()
-        if unit in self._came:
-            _, row = self._came.pop(unit)
-            told = self._steps.told(self._y, self._state, points, jnp.asarray(row)[None], proposal)
+        if (unit := self._same(np.asarray(points[0]))) is not None:
+            known = (jnp.asarray(a)[None] for a in self._came.pop(unit))
+            told = self._steps.told(self._y, self._state, *known, proposal)
             self._y, self._state, over = told
             self._over = bool(over)
             return True
@@ -193,6 +194,19 @@ class Search:
             self._state = self._steps.learnt(self._y, self._state, *known)
             return True
         return False
+
+    def _same(self, point: np.ndarray) -> bytes | None:
+        """What came of this point, which may be rounded otherwise in a program for more of them."""
+        if (unit := point.tobytes()) in self._came:
+            return unit
+        params = self._steps.parts(self._y, self._state).params()
+        size = np.abs(point) + np.asarray(params.sigma)
+        for side in (params.low, params.high):
+            if side is not None:
+                size += np.where(np.isfinite(side), np.abs(side), 0)
+        near = _ROUNDINGS * np.finfo(point.dtype).eps * size
+        same = (u for u, came in self._came.items() if np.all(np.abs(came[0] - point) <= near))
+        return next(same, None)
 
     def _wanted(self, count: int) -> Iterator[np.ndarray]:
         """What to evaluate next, in this order, without end."""

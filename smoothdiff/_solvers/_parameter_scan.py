@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
+from smoothdiff._solvers._look import closed
 
 # evaluations along a parameter: in the try of the first parameters, in a first scan, and the most
 _TRY, _FIRST, _MOST = 16, 50, 200
@@ -21,18 +22,6 @@ _TRIED = 2
 _LOWER = 0.01
 # how far the change at both places may be from the sum of the two, relative to the smaller one
 _OFF = 0.1
-
-
-def bounded(params: Params) -> bool:
-    """Whether there are bounds to both sides, open or not."""
-    return params.low is not None and params.high is not None
-
-
-def bounds_of(params: Params) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Those of parameters that are `bounded`."""
-    if params.low is None or params.high is None:
-        raise ValueError("a scan goes from bound to bound: give bounds")
-    return params.low, params.high
 
 
 class Scan(eqx.Module):
@@ -87,7 +76,7 @@ class Scan(eqx.Module):
         scan = jax.tree.map(
             lambda a, b, c: jnp.where(made, jnp.where(done, a, b), c), longer, self, first
         )
-        return scan, ~scan.failed & jnp.all(jnp.isfinite(jnp.stack(bounds_of(params))))
+        return scan, ~scan.failed & closed(params)
 
     def propose(
         self, low: Float[Array, " n"], high: Float[Array, " n"], count: int

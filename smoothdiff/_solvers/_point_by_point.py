@@ -24,6 +24,7 @@ from smoothdiff._solvers._base import (
 from smoothdiff._solvers._evaluator import Evaluator, objectives
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import Values, judged, judging
+from smoothdiff._solvers._look import Look, bounded
 from smoothdiff._solvers._point_search import AbstractPointSearch, Sizes, where
 from smoothdiff._solvers._random_numbers import in_step, takes_key
 from smoothdiff._solvers._ratio_test import taken_by_rounding
@@ -76,6 +77,8 @@ def init(
                 "function ends: call minimise from several starts instead"
             )
         search = search.averaging()
+    elif bounded(smoothed_params(solver, y, jnp.asarray(0, jnp.int32), options)):
+        search = dataclasses.replace(search, look=Look.start(search.start))
     if solver.sampler is not None:
         draw = lambda key: _normal_points(solver, key, 1, search.start)
         jax.eval_shape(draw, jax.random.key(0))
@@ -151,9 +154,12 @@ class PointStep(eqx.Module):
         least = (jnp.minimum(fun, progress.lowest_fun) == 0) & solver.squares
         least &= after.average is None
         # where a model is wrong, its steps may be short for that: a check comes after the first
-        checks = small & (search.small == 0) & ~after.right()
-        after = after.counted(small, search.checking(), lower, least, sizes.step)
-        after = where(checks, after.checked(), after)
+        looking = search.is_looking()
+        checks = small & (search.small == 0) & ~after.right() & ~looking
+        # points anywhere are no steps
+        teaches = search.checking() | looking
+        after = after.counted(small | looking, teaches, lower, least, sizes.step)
+        after = where(checks, after.checked(), after).looking(params, sizes, least)
         # the end of a step that is tried may be anything, and so may a place that nobody asked for
         later = state.restarts < solver.restarts
         if solver.nonfinite == "propagate":
@@ -172,7 +178,7 @@ class PointStep(eqx.Module):
         restarts = state.restarts
         if solver.restarts:
             lost = later & ~jnp.any(after.history.valid)
-            ended = (restarts > 0) & after.over(sizes)
+            ended = (restarts > 0) & after.over(sizes) & after.looked()
             # no other search finds less
             again = finite & (ended | lost) & ~least
             lowest_theta = params.layout.vector(jax.tree.leaves(progress.lowest_y))

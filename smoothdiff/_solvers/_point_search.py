@@ -13,11 +13,13 @@ from jaxtyping import Array, Bool, Float, Int
 from smoothdiff._params import Params
 from smoothdiff._solvers._averaging import Average
 from smoothdiff._solvers._history import History, alike
+from smoothdiff._solvers._look import Look, bounds_of, closed, length
 from smoothdiff._solvers._pilot import PAIRS, Pilot
+from smoothdiff._solvers._ratio_test import is_lower
 
 # what is evaluated next: the first points, a step of the local model, samples around a center,
-# points further and further away, or points along a parameter
-FIRST, TRUST, WIDE, PILOT, SCAN = 0, 1, 2, 3, 4
+# points further and further away, points anywhere within the bounds, or along a parameter
+FIRST, TRUST, WIDE, PILOT, LOOK, SCAN = 0, 1, 2, 3, 4, 5
 # so many small steps in a row count as convergence
 _SMALL = 3
 # a width of so many roundings of sigma is nothing
@@ -40,7 +42,7 @@ class AbstractPointSearch(eqx.Module):
     """Where a search stands: all that was evaluated, and what comes next.
 
     Where the first points are all the same, the `pilot` follows, and the first points again, as far
-    away as it found something else.
+    away as it found something else. Within bounds there is a `look` before the end.
 
     `evaluated` counts the evaluations, `small` the small steps in a row, `stale` the evaluations
     since the last lower point. There is an `average` if the function takes random numbers.
@@ -54,6 +56,7 @@ class AbstractPointSearch(eqx.Module):
     stale: Int[Array, ""]
     pilot: Pilot
     average: Average | None
+    look: Look | None
 
     @abc.abstractmethod
     def widened(
@@ -74,6 +77,10 @@ class AbstractPointSearch(eqx.Module):
 
         It has other random numbers.
         """
+
+    @abc.abstractmethod
+    def elsewhere(self, params: Params, theta: Float[Array, " n"]) -> "AbstractPointSearch":
+        """Another such search before its first points, from a point that is known."""
 
     @abc.abstractmethod
     def width(self) -> Float[Array, "..."]:
@@ -223,13 +230,58 @@ class AbstractPointSearch(eqx.Module):
         widened = eqx.tree_at(lambda s: s.evaluated, widened, one)
         return where(pilot.length > 0, widened, more)
 
+    def looking(self, params: Params, sizes: Sizes, least: Bool[Array, ""]) -> Any:
+        """With a look over all of the box next, if the search would end; not at the `least`."""
+        if (look := self.look) is None:
+            return self
+        ended = (self.converged() | self.over(sizes)) & ~look.done & ~self.is_looking()
+        starts = ended & ~least & closed(params)
+        fun = self.history.best(self.start)[2]
+        first = Look(jnp.zeros_like(look.taken), look.done, fun, self.stage)
+        stage = jnp.where(starts, LOOK, self.stage).astype(self.stage.dtype)
+        look = where(starts, first, eqx.tree_at(lambda k: k.done, look, look.done | ended))
+        return eqx.tree_at(lambda s: (s.stage, s.look), self, (stage, look))
+
+    def looked(self) -> Bool[Array, ""]:
+        """Whether there is no look to come before the end."""
+        return jnp.asarray(True) if self.look is None else self.look.done
+
+    def look_points(
+        self, params: Params, draw: Callable[[int], Float[Array, "k n"]], count: int
+    ) -> Float[Array, "K n"]:
+        """The next points of the look, evenly spread over the box."""
+        assert self.look is not None
+        low, high = bounds_of(params)
+        share = jax.scipy.special.ndtr(draw(length(len(low))))
+        at = self.look.taken + jnp.arange(count, dtype=jnp.int32)
+        share = share[jnp.minimum(at, len(share) - 1)]
+        return low[None] + share * (high - low)[None]
+
+    def after_look(self, params: Params, sizes: Sizes) -> Any:
+        """After these points: another search where one is lower, or what would have followed."""
+        assert self.look is not None
+        look, (point, _, fun) = self.look, self.history.best(self.start)
+        taken = look.taken + sizes.step
+        over = taken >= length(len(point))
+        stage = jnp.where(over, look.follows, self.stage)
+        changed = stage, taken, look.done | over
+        more = eqx.tree_at(lambda s: (s.stage, s.look.taken, s.look.done), self, changed)
+        # of its first points the start is known
+        known = jnp.full_like(self.evaluated, 1 - sizes.step)
+        anew = eqx.tree_at(lambda s: s.evaluated, self.elsewhere(params, point), known)
+        return where(over & is_lower(fun, look.before), anew, more)
+
+    def is_looking(self) -> Bool[Array, ""]:
+        """Whether points anywhere come next."""
+        return self.stage == LOOK
+
     def is_local(self) -> Bool[Array, ""]:
         """Whether a step within the trust region comes next."""
         return self.stage == TRUST
 
     def is_trial(self) -> Bool[Array, ""]:
         """Whether the next points may be anything, since nobody asked for them."""
-        return self.is_local() | (self.stage == PILOT)
+        return self.is_local() | (self.stage == PILOT) | self.is_looking()
 
     def iterate(self) -> Float[Array, " n"]:
         """The best point; of a function that takes random numbers the mean, once there is one."""

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from smoothdiff._params import Params
 from smoothdiff._solvers._first_points import FirstPoints
 from smoothdiff._solvers._history import History, alike
+from smoothdiff._solvers._look import Look
 from smoothdiff._solvers._pilot import Pilot
 from smoothdiff._solvers._point_search import (
     FIRST,
@@ -66,6 +67,7 @@ class ResidualSearch(AbstractPointSearch):
             stale=none,
             pilot=Pilot.start(theta),
             average=None,
+            look=None,
         )
 
     def again(
@@ -79,7 +81,16 @@ class ResidualSearch(AbstractPointSearch):
         """Another search, from elsewhere, with other random numbers."""
         empty = jax.tree.map(jnp.zeros_like, self.history)
         anew = ResidualSearch.of(theta, empty)
+        anew = dataclasses.replace(anew, look=self.look)
         return eqx.tree_at(lambda s: s.wide.rounds, anew, self.wide.rounds + 1)
+
+    def elsewhere(self, params: Params, theta: Float[Array, " n"]) -> "ResidualSearch":
+        """Another search, with all that was evaluated, other random numbers and another look."""
+        look = None if self.look is None else Look.start(theta)
+        anew = ResidualSearch.of(theta, self.history)
+        anew = dataclasses.replace(anew, pilot=self.pilot, average=self.average, look=look)
+        anew = eqx.tree_at(lambda s: s.wide.rounds, anew, self.wide.rounds + 1)
+        return anew.widened(params, theta, jnp.ones_like(theta[0]))
 
     def widened(
         self, params: Params, theta: Float[Array, " n"], width: Float[Array, ""]
@@ -108,6 +119,11 @@ class ResidualSearch(AbstractPointSearch):
         around = after._to_wide(jnp.ones_like(self.wide.scale))
         around = eqx.tree_at(lambda s: s.small, around, jnp.zeros_like(self.small))
         return where(doubt, around, after)
+
+    def looking(self, params: Params, sizes: Sizes, least: Array) -> "ResidualSearch":
+        """Not where little of the loss is left: no other minimum is much lower."""
+        little = self.history.best(self.start)[2] <= _MUCH * self.first.before
+        return super().looking(params, sizes, least | little)
 
     def round(self) -> Int[Array, ""]:
         """So many wide rounds."""
@@ -189,7 +205,10 @@ class ResidualSearch(AbstractPointSearch):
             return jnp.where((at == 0)[:, None], wide.center[None], points), nothing
 
         pilot = lambda: (self.pilot_points(params, draw, count), nothing)
-        return by_stage(self.stage, stage, [first, local, wide, pilot])
+        branches = [first, local, wide, pilot]
+        if self.look is not None:
+            branches.append(lambda: (self.look_points(params, draw, count), nothing))
+        return by_stage(self.stage, stage, branches)
 
     def after(
         self,
@@ -209,6 +228,8 @@ class ResidualSearch(AbstractPointSearch):
             lambda: with_rows._after_wide(params, new.rows, new.valid, sizes),
             lambda: with_rows.piloted(params, new),
         ]
+        if self.look is not None:
+            branches.append(lambda: with_rows.after_look(params, sizes))
         return by_stage(self.stage, stage, branches)
 
     def _to_wide(self, scale: Array) -> "ResidualSearch":

@@ -18,7 +18,8 @@ from smoothdiff._params import Params
 from smoothdiff._solvers._base import all_finite
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import differ
-from smoothdiff._solvers._parameter_scan import Scan, bounds_of
+from smoothdiff._solvers._look import bounds_of
+from smoothdiff._solvers._parameter_scan import Scan
 from smoothdiff._solvers._point_search import (
     FIRST,
     SCAN,
@@ -88,6 +89,8 @@ class ValueSearch(ValueState):
 
         further = lambda: (self.pilot_points(params, draw, count), nothing)
         branches = [first, local, wide, further]
+        if self.look is not None:
+            branches.append(lambda: (self.look_points(params, draw, count), nothing))
         if (scan := self.scan) is not None:
             branches.append(lambda: (scan.propose(*bounds_of(params), count), nothing))
         return by_stage(self.stage, stage, branches)
@@ -129,10 +132,12 @@ class ValueSearch(ValueState):
             return jax.lax.cond(taken >= sizes.first, full, lambda: more)
 
         branches = [first, local, wide, lambda: known.piloted(params, new)]
+        # neither model's turn
+        apart = dataclasses.replace(known, turn=self.turn)
+        if self.look is not None:
+            branches.append(lambda: apart.after_look(params, sizes))
         if (scan := self.scan) is not None:
             funs = jnp.where(new.valid, new.funs, jnp.inf)
-            # neither model's turn
-            apart = dataclasses.replace(known, turn=self.turn)
             branches.append(lambda: apart._scanned(params, scan.after(new.points, funs), sizes))
         return by_stage(self.stage, stage, branches)
 

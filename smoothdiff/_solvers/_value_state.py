@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
 from smoothdiff._solvers._history import History
+from smoothdiff._solvers._look import Look
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._parameter_scan import Scan
 from smoothdiff._solvers._pilot import Pilot
@@ -72,6 +73,7 @@ class ValueState(AbstractPointSearch):
             stale=none,
             pilot=Pilot.start(theta),
             average=None,
+            look=None,
             steps=width * sigma,
             scan=None,
             searches=none,
@@ -108,6 +110,8 @@ class ValueState(AbstractPointSearch):
             scan, scans = self.scan.next(params, *lowest)
             anew = dataclasses.replace(anew, scan=scan)
             stage = jnp.where(scans, SCAN, stage).astype(stage.dtype)
+        if self.look is not None:  # other searches follow in any case
+            anew = dataclasses.replace(anew, look=self.look)
         changed = stage, self.rounds + 1, searches, self.noisy
         return eqx.tree_at(lambda s: (s.stage, s.rounds, s.searches, s.noisy), anew, changed)
 
@@ -117,9 +121,15 @@ class ValueState(AbstractPointSearch):
         """With all first points again."""
         return self.anew(params, theta, params.sigma, width)
 
+    def elsewhere(self, params: Params, theta: Float[Array, " n"]) -> "ValueState":
+        """The same search from there, with other random numbers, and another look."""
+        anew = self.anew(params, theta, params.sigma, jnp.ones_like(self.place[0]))
+        look = None if self.look is None else Look.start(theta)
+        return dataclasses.replace(anew, rounds=self.rounds + 1, look=look)
+
     def anew(self, params: Params, theta: Array, sigma: Array, width: Array) -> "ValueState":
         """The same search from another point, with all that was evaluated."""
-        names = "pilot", "average", "searches", "rounds", "noisy", "scan"
+        names = "pilot", "average", "look", "searches", "rounds", "noisy", "scan"
         anew = self.of(params, theta, sigma, width, self.history)
         return dataclasses.replace(anew, **{name: getattr(self, name) for name in names})
 

@@ -58,6 +58,9 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     damped as by Levenberg and Marquardt. The local model takes over again once two steps of the
     regression in a row are as predicted, or once 6 (n + 1) evaluations have found nothing lower.
 
+    A search that would end with more than a tenth of the loss of its start, within finite bounds,
+    looks at 2n + 1 points spread over all of the box. If one is lower, it begins there anew.
+
     With 100 parameters and more, or with a schedule of sigma, each step takes a batch, and there is
     the wide regression alone. A batch may say little about each of so many parameters. Then 12 of
     its evaluations try the ends of 12 steps, and the best is taken if it is an improvement. Some
@@ -218,7 +221,7 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         sizes, converged = self.sizes(y), state.search.converged()
         if sizes is None:
             return stopped(state.progress, converged)
-        over = (state.restarts == 0) & state.search.over(sizes)
+        over = (state.restarts == 0) & state.search.over(sizes) & state.search.looked()
         return stopped(state.progress, over, converged)
 
     def reason(self, state: Any) -> str:

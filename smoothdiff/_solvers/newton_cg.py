@@ -18,7 +18,8 @@ from smoothdiff._solvers._base import AbstractSmoothSolver, check_settings, smoo
 from smoothdiff._solvers._evaluator import Evaluator
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import by_rows
-from smoothdiff._solvers._parameter_scan import Scan, bounded
+from smoothdiff._solvers._look import bounded
+from smoothdiff._solvers._parameter_scan import Scan
 from smoothdiff._solvers._point_search import Sizes
 from smoothdiff._solvers._value_search import ValueSearch
 
@@ -58,6 +59,9 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
 
     With 100 parameters and more, or with an optax schedule of sigma, each step takes a batch, and
     the wide model alone.
+
+    Within finite bounds a search that would end looks at 2n + 1 points spread over all of the box.
+    If one is lower, the next search begins there, as the first one did, and ends as that does.
 
     Bounds are never left. A sample beyond them is clamped or, where that would throw it out of a
     narrow valley, pulled back along its ray, and the models take it where it was evaluated.
@@ -197,6 +201,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
             return stopped(state.progress, _newton_batches.over(self, state))
         converged = state.search.converged()
         over = (state.restarts == 0) & (converged | state.search.over(sizes))
+        over &= state.search.looked()
         return stopped(state.progress, over, converged)
 
     def reason(self, state: Any) -> str:

@@ -1,0 +1,138 @@
+"""Before a search ends within bounds it looks elsewhere: what is found there, and what it costs."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+import smoothdiff as sd
+
+LOW, HIGH = jnp.zeros(2), jnp.ones(2)
+BASIN, DIP, START = jnp.array([0.3, 0.35]), jnp.array([0.95, 0.95]), jnp.array([0.93, 0.93])
+
+
+def residuals(y, args=None):
+    """A basin over most of the box, and a dip that is not as low in its corner."""
+    dip, basin = jnp.append((y - DIP) / 5, 1.1), jnp.append(y - BASIN, 0.0)
+    return jnp.where(jnp.all(y > 0.85), dip, basin)
+
+
+def loss(y, args=None):
+    return jnp.sum(residuals(y) ** 2)
+
+
+CASES = [(sd.minimise, sd.NewtonCG, loss), (sd.least_squares, sd.GaussNewton, residuals)]
+each = pytest.mark.parametrize(("call", "solver", "fun"), CASES, ids=["number", "residuals"])
+
+
+def watched(fun, points):
+    """The function, with all points that it was evaluated at, the first call included."""
+
+    def seen(y):
+        points.append(np.asarray(y))
+        return np.asarray(fun(y))
+
+    out = jax.eval_shape(fun, START)
+    box = sd.black_box(seen, jax.ShapeDtypeStruct(out.shape, out.dtype))
+    return lambda y, args: box(y)
+
+
+@each
+@pytest.mark.parametrize("seed", range(3))
+def test_a_poor_minimum_is_left(call, solver, fun, seed):
+    key = jax.random.key(seed)
+    stays = call(fun, START, solver=solver(0.01), key=key)
+    np.testing.assert_allclose(stays.y, DIP, atol=0.01)
+    left = call(fun, START, solver=solver(0.01), key=key, bounds=(LOW, HIGH))
+    assert left.reason == "converged"
+    np.testing.assert_allclose(left.y, BASIN, atol=1e-3)
+
+
+@each
+def test_it_is_left_under_optimistix_too(call, solver, fun):
+    run = optx.minimise if call is sd.minimise else optx.least_squares
+    options = {"key": jax.random.key(0), "bounds": (LOW, HIGH)}
+    found = run(fun, solver(0.01), START, options=options, max_steps=2000)
+    np.testing.assert_allclose(found.value, BASIN, atol=1e-3)
+
+
+@each
+def test_it_is_left_by_asking_and_telling(call, solver, fun):
+    settings = {"key": jax.random.key(0), "bounds": (LOW, HIGH), "residuals": solver.squares}
+    search = sd.Search(START, solver=solver(0.01), **settings)
+    for _ in range(400):
+        if search.done:
+            break
+        points = search.ask(3)
+        search.tell(points, [np.asarray(fun(point)) for point in points])
+    assert search.done
+    np.testing.assert_allclose(search.y, BASIN, atol=1e-3)
+
+
+def left_over(y):
+    """Residuals of which most of the loss cannot go away."""
+    return jnp.append(y - BASIN, 1.0)
+
+
+bowl = lambda y: jnp.sum((y - BASIN) ** 2)
+ENDS = [
+    (sd.minimise, sd.NewtonCG, bowl, 5),
+    (sd.least_squares, sd.GaussNewton, left_over, 5),
+    (sd.least_squares, sd.GaussNewton, lambda y: y - BASIN, 0),
+]
+
+
+@pytest.mark.parametrize(("call", "solver", "fun", "more"), ENDS, ids=["number", "much", "none"])
+def test_a_good_minimum_costs_two_points_a_parameter_and_one(call, solver, fun, more):
+    runs = []
+    for bounds in ((-jnp.inf, jnp.inf), (LOW, HIGH)):
+        points = []
+        result = call(
+            watched(fun, points),
+            jnp.array([0.5, 0.5]),
+            solver=solver(0.1, rtol=1e-2),
+            key=jax.random.key(0),
+            bounds=bounds,
+        )
+        assert result.reason == "converged"
+        np.testing.assert_allclose(result.y, BASIN, atol=0.01)
+        runs.append(np.array(points))
+    known, all_points = runs
+    assert len(all_points) == len(known) + more
+    apart = ~np.all(np.isclose(all_points[: len(known)], known, atol=1e-5), axis=1)
+    first = np.argmax(apart) if more else len(known)
+    looked, rest = np.split(all_points, [first, first + more])[1:]
+    np.testing.assert_allclose(rest, known[first:], atol=1e-5)
+    if more:  # to both sides of the middle
+        assert np.all((looked >= 0) & (looked <= 1))
+        assert np.all((looked.min(0) < 0.5) & (looked.max(0) > 0.5))
+
+
+@each
+def test_failures_elsewhere_end_nothing(call, solver, fun):
+    fails = lambda y, args: jnp.where(jnp.all(y > 0.85), fun(y), jnp.nan)
+    result = call(fails, START, solver=solver(0.01), key=jax.random.key(0), bounds=(LOW, HIGH))
+    assert result.reason == "converged"
+    np.testing.assert_allclose(result.y, DIP, atol=0.01)
+
+
+@each
+def test_several_points_at_once(call, solver, fun):
+    result = call(
+        fun, START, solver=solver(0.01, num_samples=4), key=jax.random.key(0), bounds=(LOW, HIGH)
+    )
+    np.testing.assert_allclose(result.y, BASIN, atol=1e-3)
+
+
+def test_a_limit_ends_a_look():
+    points = []
+    fun = watched(bowl, points)
+    settings = {"solver": sd.NewtonCG(0.2), "key": jax.random.key(0)}
+    free = sd.minimise(fun, START, **settings)
+    result = sd.minimise(
+        fun, START, bounds=(LOW, HIGH), max_evaluations=free.evaluations + 2, **settings
+    )
+    assert result.reason == "max_evaluations"
+    assert result.evaluations == free.evaluations + 2
+    np.testing.assert_allclose(result.y, BASIN, atol=1e-3)
