@@ -17,6 +17,9 @@ import scipy.optimize
 from closed_forms import largest
 
 import smoothdiff as sd
+from smoothdiff._params import take_apart
+from smoothdiff._solvers._history import History
+from smoothdiff._solvers._wide_rounds import Wide
 
 KEY = jax.random.key(3)
 SIZE = 40  # residuals of each problem in the plane; the last of them may be zeros
@@ -634,3 +637,22 @@ def test_solvers_of_optimistix_run_on_a_smoothed_function(solver):
     y, (before, after) = run(jnp.array([12.0, 21.5]))
     assert after < before
     np.testing.assert_allclose(y, target, atol=1.0)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_wide_samples_stay_wide_along_a_parameter_that_tells_little(seed):
+    pixels, n = jnp.linspace(-2.0, 2.0, 64), 3
+    points = jax.random.normal(jax.random.key(seed), (16, n))
+    # edges that jump along the first parameter, one pixel along the second, none along the third
+    rows = (
+        jnp.where(pixels[None] < points[:, :1], 1.0, 0.0) - jnp.where(pixels < 0.3, 1.0, 0.0)[None]
+    )
+    rows = rows.at[:, 0].set(0.1 * points[:, 1])
+    history = History(points, rows, jnp.sum(rows**2, axis=1) / 2, jnp.ones(16, bool))
+    params = take_apart(jnp.zeros(n), 1.0, None)
+    wide = Wide.start(jnp.zeros(n), jnp.ones(64), jnp.ones(n))
+    for _ in range(3):  # once it may grow by a half, and fall to a quarter
+        wide = wide.stepped(history, params, jnp.asarray(16))
+    first, _, third = wide.scale
+    assert first < third / 2
+    assert jnp.min(wide.scale) >= 0.1 * jnp.max(wide.scale)

@@ -43,8 +43,8 @@ class Average(eqx.Module):
 
 
 def apart(
-    width: Float[Array, ""], noise: Float[Array, ""], signal: Float[Array, ""]
-) -> Float[Array, ""]:
+    width: Float[Array, "..."], noise: Float[Array, ""], signal: Float[Array, ""]
+) -> Float[Array, "..."]:
     """How wide the next samples are at least, relative to sigma.
 
     So wide that they differ by as much as the noise; at most one.

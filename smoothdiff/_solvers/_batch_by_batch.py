@@ -169,6 +169,7 @@ def step(
     if not callable(solver.sigma):
         # a few that are the same call for more of them first
         flat = same & (batch.count == count)
+        error = jnp.sqrt(jnp.mean(error**2))
         scale = next_scale(scale, flat, history, here, u, error, longest / LONGEST)
 
     fun, stderr = batch.loss()

@@ -62,7 +62,7 @@ class ResidualSearch(AbstractPointSearch):
             evaluated=none,
             first=FirstPoints.start(theta),
             trust=TrustRegion.start(one, n, size),
-            wide=Wide.start(theta, jnp.zeros(size, theta.dtype), one),
+            wide=Wide.start(theta, jnp.zeros(size, theta.dtype), jnp.ones_like(theta)),
             small=none,
             stale=none,
             pilot=Pilot.start(theta),
@@ -135,13 +135,13 @@ class ResidualSearch(AbstractPointSearch):
 
     def smoothing(self) -> Float[Array, ""]:
         """Half the squares of what the linear model adds."""
-        return jnp.sum((self.trust.jacobian * self._radius()) ** 2) / 2
+        return jnp.sum((self.trust.jacobian * self._radius()[:, None]) ** 2) / 2
 
     def width(self) -> Float[Array, " n"]:
         """How far from the iterate the function is looked at, relative to sigma."""
         return self.first.reach * self._radius()
 
-    def _radius(self) -> Float[Array, ""]:
+    def _radius(self) -> Float[Array, " n"]:
         return jnp.where(self.stage == WIDE, self.wide.scale, self.trust.radius)
 
     def _scaled(self, params: Params) -> Params:
@@ -294,7 +294,7 @@ class ResidualSearch(AbstractPointSearch):
         radius = jnp.where(
             came_true,
             2 * jnp.linalg.norm(wide.move / params.sigma),
-            _NARROWER * jnp.minimum(wide.scale, 1),
+            _NARROWER * jnp.minimum(jnp.sqrt(jnp.mean(wide.scale**2)), 1),
         )
         radius = jnp.maximum(jnp.asarray(radius), jnp.finfo(fun.dtype).eps)
         anew = TrustRegion.start(jnp.asarray(radius), *self.trust.jacobian.shape)

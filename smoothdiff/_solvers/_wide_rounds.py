@@ -11,10 +11,13 @@ from smoothdiff._solvers._history import History, alike
 from smoothdiff._solvers._parameter_regression import gauss_newton_step
 from smoothdiff._solvers._residual_batch import centred
 
-# sigma follows twice the standard error of the step, at most so much smaller or larger at a time
+# each sigma follows twice the standard error of the step, at most so much smaller or larger at a
+# time
 _SHRINK, _GROW = 0.25, 1.5
 # ... and no wider than so many times what the user gave, unless all samples are the same
 _WIDEST = 2.0
+# ... and no parameter by less than so much of the widest one
+_NARROWEST = 0.1
 # the longest step of any parameter, in units of its sigma: beyond it nothing has been seen
 LONGEST = 2.0
 # a step is tried so many times as far, where that is at least sigma
@@ -22,18 +25,18 @@ _FURTHER = 5.0
 
 
 class Wide(eqx.Module):
-    """A round of samples: `taken` of them so far, `scale` wide, around the end of the last `move`.
+    """A round of samples: `taken` of them so far, around the end of the last `move`.
 
-    `rounds` counts them, `true` those in a row that came true, `idle` the evaluations without a
-    lower point, `found` says that there was one, `before` is the loss at the last
-    center, `row` the residuals at this one, and `seen` says that the last samples were not the
-    same.
+    They are `scale` wide along each parameter, relative to sigma. `rounds` counts them, `true`
+    those in a row that came true, `idle` the evaluations without a lower point, `found` says that
+    there was one, `before` is the loss at the last center, `row` the residuals at this one, and
+    `seen` says that the last samples were not the same.
     """
 
     center: Float[Array, " n"]
     row: Float[Array, " P"]
     move: Float[Array, " n"]
-    scale: Float[Array, ""]
+    scale: Float[Array, " n"]
     before: Float[Array, ""]
     taken: Int[Array, ""]
     rounds: Int[Array, ""]
@@ -43,7 +46,7 @@ class Wide(eqx.Module):
     seen: Bool[Array, ""]
 
     @staticmethod
-    def start(center: Array, row: Array, scale: Array) -> "Wide":
+    def start(center: Array, row: Array, scale: Float[Array, " n"]) -> "Wide":
         """The first round, around a point that is known."""
         none = jnp.zeros((), jnp.int32)
         before = jnp.asarray(jnp.inf, row.dtype)
@@ -65,22 +68,24 @@ class Wide(eqx.Module):
         u = (history.points - center[None]) / sigma[None]
         sides = sides_of(params, center, sigma)
         move, error = gauss_newton_step(u, history.rows, history.valid, *sides)
-        longest = jnp.max(jnp.abs(move))
-        move = move / jnp.maximum(1, longest / LONGEST)
+        length = jnp.abs(move) / LONGEST
+        move = move / jnp.maximum(1, jnp.max(length))
         theta = params.clip(center + sigma * move)
         fresh = history.valid & (jnp.arange(len(u)) >= len(u) - count)
         some = history.rows[jnp.argmax(fresh)]
         same = jnp.all(alike(history.rows, some) | ~fresh)
         # a few that are the same call for more of them first
         flat = same & ~self.seen
-        scale = next_scale(self.scale, flat, history, here, u, error, longest / LONGEST)
+        scale = next_scale(self.scale, flat, history, here, u, error, length)
+        # what is narrow by chance would hardly be seen again
+        scale = jnp.maximum(scale, _NARROWEST * jnp.max(scale))
         if takes_key:
             least = apart(self.scale, *_noise_and_signal(u, history.rows, history.valid))
             scale = jnp.where(flat, scale, jnp.maximum(scale, least))
         # where most samples gave no numbers they were too far away
         few = 2 * jnp.sum(fresh) < count
         scale = jnp.where(few, self.scale / 2, scale)
-        finite = jnp.all(jnp.isfinite(theta)) & jnp.isfinite(scale)
+        finite = jnp.all(jnp.isfinite(theta)) & jnp.all(jnp.isfinite(scale))
         return Wide(
             center=jnp.where(finite, theta, center),
             row=self.row,
@@ -114,30 +119,30 @@ def sides_of(
 
 
 def next_scale(
-    scale: Float[Array, ""],
+    scale: Float[Array, "..."],
     flat: Bool[Array, ""],
     history: History,
     here: Float[Array, " P"],
     u: Float[Array, "M n"],
-    error: Float[Array, " n"],
-    length: Float[Array, ""],
-) -> Float[Array, ""]:
+    error: Float[Array, "..."],
+    length: Float[Array, "..."],
+) -> Float[Array, "..."]:
     """How wide the next samples are, relative to sigma.
 
     Args:
-        scale: That of these.
+        scale: That of these, one number or one for each parameter.
         flat: All of them are the same; then the next ones are twice as wide.
         history: All samples, these included.
         here: The residuals where the step starts, at the iterate or a better point.
         u: The points of the history as seen from there.
         error: The standard error of the step.
-        length: Of the step.
+        length: Of the step, in longest ones.
     """
     # a plateau of the residuals around the iterate is seen whole or not at all
     plateau = history.valid & alike(history.rows, here)
     extent = jnp.max(jnp.where(plateau, jnp.sqrt(jnp.mean(u**2, axis=1)), 0))
-    wanted = jnp.maximum(2 * jnp.sqrt(jnp.mean(error**2)), length)
-    wanted = jnp.clip(jnp.maximum(wanted, extent), _SHRINK, _GROW)
+    wanted = jnp.maximum(jnp.maximum(2 * error, length), extent)
+    wanted = jnp.clip(wanted, _SHRINK, _GROW)
     return jnp.where(flat, 2 * scale, jnp.minimum(wanted * scale, _WIDEST))
 
 

@@ -55,7 +55,8 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
 
     The metric $\Gamma$ is the covariance of what a linear model of the last `history` evaluations
     cannot explain. So pixels that jump at random have no say. Where all pixels do, the step is
-    damped as by Levenberg and Marquardt. The local model takes over again once two steps of the
+    damped as by Levenberg and Marquardt. The width of each parameter follows its standard error: one
+    that tells little so far stays wide while others are narrow. The local model takes over again once two steps of the
     regression in a row are as predicted, or once 6 (n + 1) evaluations have found nothing lower.
 
     A search that would end with more than a tenth of the loss of its start, within finite bounds,
