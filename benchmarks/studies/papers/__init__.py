@@ -175,7 +175,7 @@ def draw(results: dict[str, Any], folder: Path) -> None:
     tasks = results["tasks"]
     looks = (("published", 0), ("best", 1))
     titles = [task["title"] for task in tasks.values()]
-    with panels(folder / "papers.png", titles, 3, (3.4, 2.6)) as (drawn, axes):
+    with panels(folder / "papers.png", titles, 2, (4.6, 2.7)) as (drawn, axes):
         for axis, task in zip(axes.flat, tasks.values(), strict=False):
             names, most = list(task["lines"]), _most(task)
             for kind, colour in looks:
@@ -187,7 +187,7 @@ def draw(results: dict[str, Any], folder: Path) -> None:
                     ends = [took["lower"], took["upper"] or most]
                     axis.hlines(here, *ends, color=COLOURS[colour], lw=4, alpha=0.4)
                     axis.plot(took["median"], here, "o", color=COLOURS[colour], ms=4)
-            shown = NAMES | {"cma_es": "CMA-ES", "shortest_call": "ours"}
+            shown = NAMES | {"cma_es": "CMA-ES", "shortest_call": "shortest call"}
             axis.set(yticks=range(len(names)), yticklabels=[shown[name] for name in names])
             axis.set(xscale="log", ylim=(len(names) - 0.5, -0.5))
             axis.set_xlim(right=most)
