@@ -15,7 +15,8 @@ from smoothdiff._params import as_key, layout_of
 from smoothdiff._run import inexact
 from smoothdiff._solvers import AbstractSmoothSolver
 from smoothdiff._solvers._base import write_options
-from smoothdiff._solvers._point_search import TRUST
+from smoothdiff._solvers._look import bounds_of
+from smoothdiff._solvers._point_search import LOOK, TRUST
 from smoothdiff._unit_space import UnitSpace
 
 # a point is given out again once so many others were told, for each that is out, and some more
@@ -199,14 +200,15 @@ class Search:
         """What came of this point, which may be rounded otherwise in a program for more of them."""
         if (unit := point.tobytes()) in self._came:
             return unit
+        if not self._came or self._state.search.stage == TRUST:  # that comes from one program
+            return None
         params = self._steps.parts(self._y, self._state).params()
         size = np.abs(point) + np.asarray(params.sigma)
-        for side in (params.low, params.high):
-            if side is not None:
-                size += np.where(np.isfinite(side), np.abs(side), 0)
-        near = _ROUNDINGS * np.finfo(point.dtype).eps * size
-        same = (u for u, came in self._came.items() if np.all(np.abs(came[0] - point) <= near))
-        return next(same, None)
+        if self._state.search.stage == LOOK:
+            size += sum(np.abs(np.asarray(side)) for side in bounds_of(params))
+        away = {u: np.max(np.abs(came[0] - point) / size) for u, came in self._came.items()}
+        nearest = min(away, key=away.__getitem__)
+        return nearest if away[nearest] <= _ROUNDINGS * np.finfo(point.dtype).eps else None
 
     def _wanted(self, count: int) -> Iterator[np.ndarray]:
         """What to evaluate next, in this order, without end."""

@@ -55,6 +55,8 @@ def test_it_is_left_under_optimistix_too(call, solver, fun):
     options = {"key": jax.random.key(0), "bounds": (LOW, HIGH)}
     found = run(fun, solver(0.01), START, options=options, max_steps=2000)
     np.testing.assert_allclose(found.value, BASIN, atol=1e-3)
+    here = call(fun, START, solver=solver(0.01), **options)
+    assert abs(found.stats["num_steps"] - len(here.history)) <= 2  # but for rounding
 
 
 @each
@@ -107,6 +109,34 @@ def test_a_good_minimum_costs_two_points_a_parameter_and_one(call, solver, fun, 
     if more:  # to both sides of the middle
         assert np.all((looked >= 0) & (looked <= 1))
         assert np.all((looked.min(0) < 0.5) & (looked.max(0) > 0.5))
+
+
+@each
+def test_where_a_bound_is_open_nobody_looks(call, solver, fun):
+    points = []
+    for high in (HIGH, jnp.array([1.0, jnp.inf])):
+        points.append([])
+        result = call(
+            watched(fun, points[-1]),
+            START,
+            solver=solver(0.01),
+            key=jax.random.key(0),
+            bounds=(LOW, high),
+        )
+        assert result.reason == "converged"
+    np.testing.assert_allclose(result.y, DIP, atol=0.01)
+    assert np.min(points[0]) < 0.5 < np.min(points[1])
+
+
+def test_a_zero_of_all_residuals_ends_a_look():
+    points = []
+    dip = lambda y: jnp.where(jnp.all(y > 0.85), jnp.append((y - DIP) / 5, 1.1), jnp.zeros(3))
+    fun = watched(dip, points)
+    settings = {"solver": sd.GaussNewton(0.01), "key": jax.random.key(0), "bounds": (LOW, HIGH)}
+    result = sd.least_squares(fun, START, **settings)
+    assert (result.reason, result.fun) == ("converged", 0)
+    # the first that is nobody else's point, and the judgement
+    assert np.sum(np.any(np.array(points) < 0.8, axis=1)) == 2
 
 
 @each

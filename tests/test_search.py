@@ -165,3 +165,17 @@ def test_there_is_always_another_point():
         assert len({point.tobytes() for point in points}) == 2
         search.tell(points, [(y[0] - 1) ** 2 + (y[1] + 2) ** 2 for y in points])
     np.testing.assert_array_equal(search.y, [1, -2])
+
+
+def test_bounds_far_away_change_nothing():
+    """Points are told apart by rounding, whose size is not that of the box."""
+    valley = lambda y: np.array([10 * (y[1] - y[0] ** 2), 1 - y[0]], np.float32)
+    took = []
+    for far in (1e3, 1e5):
+        settings = {"solver": sd.GaussNewton(0.1), "residuals": True, "bounds": (-far, far)}
+        search = sd.Search(jnp.array([-1.2, 1.0]), key=jax.random.key(2), **settings)
+        while search.fun > 1e-5 and search.evaluations < 200:
+            points = search.ask(3)
+            search.tell(points, [valley(point) for point in points])
+        took.append(search.evaluations)
+    assert took[0] == took[1] < 100

@@ -157,7 +157,7 @@ class PointStep(eqx.Module):
         looking = search.is_looking()
         checks = small & (search.small == 0) & ~after.right() & ~looking
         # points anywhere are no steps
-        teaches = search.checking() | looking
+        teaches, lower = search.checking() | looking, lower & ~looking
         after = after.counted(small | looking, teaches, lower, least, sizes.step)
         after = where(checks, after.checked(), after).looking(params, sizes, least)
         # the end of a step that is tried may be anything, and so may a place that nobody asked for
@@ -259,7 +259,7 @@ class PointStep(eqx.Module):
 
 def _samples(solver: Any, key: Array, search: AbstractPointSearch, count: int) -> Array:
     """Standard normal points for a round."""
-    return _normal_points(solver, jax.random.fold_in(key, search.round()), count, search.start)
+    return _normal_points(solver, jax.random.fold_in(key, search.seed()), count, search.start)
 
 
 def _normal_points(solver: Any, key: Array, count: int, like: Float[Array, " n"]) -> Array:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from smoothdiff._params import Params
 from smoothdiff._solvers._averaging import Average
 from smoothdiff._solvers._history import History, alike
-from smoothdiff._solvers._look import Look, bounds_of, closed, length
+from smoothdiff._solvers._look import Look, closed
 from smoothdiff._solvers._pilot import PAIRS, Pilot
 from smoothdiff._solvers._ratio_test import is_lower
 
@@ -235,41 +235,37 @@ class AbstractPointSearch(eqx.Module):
         if (look := self.look) is None:
             return self
         ended = (self.converged() | self.over(sizes)) & ~look.done & ~self.is_looking()
-        starts = ended & ~least & closed(params)
-        fun = self.history.best(self.start)[2]
-        first = Look(jnp.zeros_like(look.taken), look.done, fun, self.stage)
+        starts = ended & ~least & ~self.is_good() & closed(params)
         stage = jnp.where(starts, LOOK, self.stage).astype(self.stage.dtype)
-        look = where(starts, first, eqx.tree_at(lambda k: k.done, look, look.done | ended))
-        return eqx.tree_at(lambda s: (s.stage, s.look), self, (stage, look))
+        begun = look.begun(self.history.best(self.start)[2], self.stage)
+        done = eqx.tree_at(lambda k: k.done, look, look.done | ended | least)
+        return eqx.tree_at(lambda s: (s.stage, s.look), self, (stage, where(starts, begun, done)))
+
+    def is_good(self) -> Bool[Array, ""]:
+        """Whether the lowest point is so low that no look is needed."""
+        return jnp.asarray(False)
 
     def looked(self) -> Bool[Array, ""]:
         """Whether there is no look to come before the end."""
         return jnp.asarray(True) if self.look is None else self.look.done
 
-    def look_points(
-        self, params: Params, draw: Callable[[int], Float[Array, "k n"]], count: int
-    ) -> Float[Array, "K n"]:
-        """The next points of the look, evenly spread over the box."""
+    def after_look(self, params: Params, count: int) -> Any:
+        """After so many of its points: a new search where one is lower, or what would follow."""
         assert self.look is not None
-        low, high = bounds_of(params)
-        share = jax.scipy.special.ndtr(draw(length(len(low))))
-        at = self.look.taken + jnp.arange(count, dtype=jnp.int32)
-        share = share[jnp.minimum(at, len(share) - 1)]
-        return low[None] + share * (high - low)[None]
-
-    def after_look(self, params: Params, sizes: Sizes) -> Any:
-        """After these points: another search where one is lower, or what would have followed."""
-        assert self.look is not None
-        look, (point, _, fun) = self.look, self.history.best(self.start)
-        taken = look.taken + sizes.step
-        over = taken >= length(len(point))
-        stage = jnp.where(over, look.follows, self.stage)
-        changed = stage, taken, look.done | over
-        more = eqx.tree_at(lambda s: (s.stage, s.look.taken, s.look.done), self, changed)
+        point, _, fun = self.history.best(self.start)
+        look = self.look.more(count, len(point))
+        stage = jnp.where(look.done, look.follows, self.stage)
+        more = eqx.tree_at(lambda s: (s.stage, s.look), self, (stage, look))
         # of its first points the start is known
-        known = jnp.full_like(self.evaluated, 1 - sizes.step)
-        anew = eqx.tree_at(lambda s: s.evaluated, self.elsewhere(params, point), known)
-        return where(over & is_lower(fun, look.before), anew, more)
+        known = jnp.full_like(self.evaluated, 1 - count), look.again()
+        anew = self.elsewhere(params, point)
+        anew = eqx.tree_at(lambda s: (s.evaluated, s.look), anew, known)
+        return where(look.done & is_lower(fun, look.before), anew, more)
+
+    def seed(self) -> Int[Array, ""]:
+        """Of the next samples: another one for each round, look, and search after one."""
+        look = self.look
+        return self.round() if look is None else self.round() + look.seed(self.is_looking())
 
     def is_looking(self) -> Bool[Array, ""]:
         """Whether points anywhere come next."""

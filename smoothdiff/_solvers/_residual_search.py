@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from smoothdiff._params import Params
 from smoothdiff._solvers._first_points import FirstPoints
 from smoothdiff._solvers._history import History, alike
-from smoothdiff._solvers._look import Look
+from smoothdiff._solvers._look import length
 from smoothdiff._solvers._pilot import Pilot
 from smoothdiff._solvers._point_search import (
     FIRST,
@@ -85,11 +85,9 @@ class ResidualSearch(AbstractPointSearch):
         return eqx.tree_at(lambda s: s.wide.rounds, anew, self.wide.rounds + 1)
 
     def elsewhere(self, params: Params, theta: Float[Array, " n"]) -> "ResidualSearch":
-        """Another search, with all that was evaluated, other random numbers and another look."""
-        look = None if self.look is None else Look.start(theta)
+        """Another search, with all that was evaluated."""
         anew = ResidualSearch.of(theta, self.history)
-        anew = dataclasses.replace(anew, pilot=self.pilot, average=self.average, look=look)
-        anew = eqx.tree_at(lambda s: s.wide.rounds, anew, self.wide.rounds + 1)
+        anew = dataclasses.replace(anew, pilot=self.pilot, look=self.look)
         return anew.widened(params, theta, jnp.ones_like(theta[0]))
 
     def widened(
@@ -114,16 +112,17 @@ class ResidualSearch(AbstractPointSearch):
         """Before the minimum of a ripple is taken for the answer, wide rounds look around once."""
         after = super().counted(small, check, lower, least, count)
         unseen = (self.wide.rounds == 0) & self.is_local() & self.trust.of_ripple()
-        much = self.history.best(self.start)[2] > _MUCH * self.first.before
-        doubt = after.converged() & unseen & much & ~least
+        doubt = after.converged() & unseen & self._much() & ~least
         around = after._to_wide(jnp.ones_like(self.wide.scale))
         around = eqx.tree_at(lambda s: s.small, around, jnp.zeros_like(self.small))
         return where(doubt, around, after)
 
-    def looking(self, params: Params, sizes: Sizes, least: Array) -> "ResidualSearch":
-        """Not where little of the loss is left: no other minimum is much lower."""
-        little = self.history.best(self.start)[2] <= _MUCH * self.first.before
-        return super().looking(params, sizes, least | little)
+    def is_good(self) -> Bool[Array, ""]:
+        """Where little of the loss is left, no other minimum is much lower."""
+        return ~self._much()
+
+    def _much(self) -> Bool[Array, ""]:
+        return self.history.best(self.start)[2] > _MUCH * self.first.before
 
     def round(self) -> Int[Array, ""]:
         """So many wide rounds."""
@@ -206,8 +205,8 @@ class ResidualSearch(AbstractPointSearch):
 
         pilot = lambda: (self.pilot_points(params, draw, count), nothing)
         branches = [first, local, wide, pilot]
-        if self.look is not None:
-            branches.append(lambda: (self.look_points(params, draw, count), nothing))
+        if (look := self.look) is not None:
+            branches.append(lambda: (look.points(params, draw(length(n)), count), nothing))
         return by_stage(self.stage, stage, branches)
 
     def after(
@@ -229,7 +228,7 @@ class ResidualSearch(AbstractPointSearch):
             lambda: with_rows.piloted(params, new),
         ]
         if self.look is not None:
-            branches.append(lambda: with_rows.after_look(params, sizes))
+            branches.append(lambda: with_rows.after_look(params, sizes.step))
         return by_stage(self.stage, stage, branches)
 
     def _to_wide(self, scale: Array) -> "ResidualSearch":

@@ -18,7 +18,7 @@ from smoothdiff._params import Params
 from smoothdiff._solvers._base import all_finite
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import differ
-from smoothdiff._solvers._look import bounds_of
+from smoothdiff._solvers._look import bounds_of, length
 from smoothdiff._solvers._parameter_scan import Scan
 from smoothdiff._solvers._point_search import (
     FIRST,
@@ -89,8 +89,8 @@ class ValueSearch(ValueState):
 
         further = lambda: (self.pilot_points(params, draw, count), nothing)
         branches = [first, local, wide, further]
-        if self.look is not None:
-            branches.append(lambda: (self.look_points(params, draw, count), nothing))
+        if (look := self.look) is not None:
+            branches.append(lambda: (look.points(params, draw(length(n)), count), nothing))
         if (scan := self.scan) is not None:
             branches.append(lambda: (scan.propose(*bounds_of(params), count), nothing))
         return by_stage(self.stage, stage, branches)
@@ -135,7 +135,7 @@ class ValueSearch(ValueState):
         # neither model's turn
         apart = dataclasses.replace(known, turn=self.turn)
         if self.look is not None:
-            branches.append(lambda: apart.after_look(params, sizes))
+            branches.append(lambda: apart.after_look(params, sizes.step))
         if (scan := self.scan) is not None:
             funs = jnp.where(new.valid, new.funs, jnp.inf)
             branches.append(lambda: apart._scanned(params, scan.after(new.points, funs), sizes))

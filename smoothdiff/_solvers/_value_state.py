@@ -9,7 +9,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
 from smoothdiff._solvers._history import History
-from smoothdiff._solvers._look import Look
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._parameter_scan import Scan
 from smoothdiff._solvers._pilot import Pilot
@@ -110,8 +109,8 @@ class ValueState(AbstractPointSearch):
             scan, scans = self.scan.next(params, *lowest)
             anew = dataclasses.replace(anew, scan=scan)
             stage = jnp.where(scans, SCAN, stage).astype(stage.dtype)
-        if self.look is not None:  # other searches follow in any case
-            anew = dataclasses.replace(anew, look=self.look)
+        # its place is as good as that of a look, of which there is no other
+        anew = dataclasses.replace(anew, look=self.look)
         changed = stage, self.rounds + 1, searches, self.noisy
         return eqx.tree_at(lambda s: (s.stage, s.rounds, s.searches, s.noisy), anew, changed)
 
@@ -122,10 +121,9 @@ class ValueState(AbstractPointSearch):
         return self.anew(params, theta, params.sigma, width)
 
     def elsewhere(self, params: Params, theta: Float[Array, " n"]) -> "ValueState":
-        """The same search from there, with other random numbers, and another look."""
-        anew = self.anew(params, theta, params.sigma, jnp.ones_like(self.place[0]))
-        look = None if self.look is None else Look.start(theta)
-        return dataclasses.replace(anew, rounds=self.rounds + 1, look=look)
+        """The same search from there."""
+        anew = self.anew(params, theta, params.sigma, jnp.ones_like(theta[0]))
+        return dataclasses.replace(anew, rounds=jnp.zeros_like(self.rounds))
 
     def anew(self, params: Params, theta: Array, sigma: Array, width: Array) -> "ValueState":
         """The same search from another point, with all that was evaluated."""

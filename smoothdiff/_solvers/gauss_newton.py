@@ -55,12 +55,14 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
 
     The metric $\Gamma$ is the covariance of what a linear model of the last `history` evaluations
     cannot explain. So pixels that jump at random have no say. Where all pixels do, the step is
-    damped as by Levenberg and Marquardt. The width of each parameter follows its standard error: one
-    that tells little so far stays wide while others are narrow. The local model takes over again once two steps of the
-    regression in a row are as predicted, or once 6 (n + 1) evaluations have found nothing lower.
+    damped as by Levenberg and Marquardt. The width of each parameter follows its standard error:
+    one that tells little so far stays wide while others are narrow. The local model takes over
+    again once two steps of the regression in a row are as predicted, or once 6 (n + 1) evaluations
+    have found nothing lower.
 
-    A search that would end with more than a tenth of the loss of its start, within finite bounds,
-    looks at 2n + 1 points spread over all of the box. If one is lower, it begins there anew.
+    Within finite bounds a search that would end with more than a tenth of the loss of its start
+    looks at 2n + 1 points spread over all of the box, which may be not finite. If one is lower, it
+    begins there anew. Among `restarts` only the first does.
 
     With 100 parameters and more, or with a schedule of sigma, each step takes a batch, and there is
     the wide regression alone. A batch may say little about each of so many parameters. Then 12 of

@@ -61,7 +61,8 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     the wide model alone.
 
     Within finite bounds a search that would end looks at 2n + 1 points spread over all of the box.
-    If one is lower, the next search begins there, as the first one did, and ends as that does.
+    They may be not finite. If one is lower, it begins there anew. Among `restarts` only the first
+    search does.
 
     Bounds are never left. A sample beyond them is clamped or, where that would throw it out of a
     narrow valley, pulled back along its ray, and the models take it where it was evaluated.
