@@ -272,8 +272,9 @@ def test_runs_of_optimistix_on_pytrees_inside_jit_are_those_on_vectors(x64):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("precision", "restarts"), [("float32", True), ("float64", False)])
+@pytest.mark.parametrize(("precision", "restarts"), [("float32", False), ("float64", True)])
 def test_iterates_are_those_of_optimistix_but_for_rounding(precision, restarts):
+    # residuals that jump amplify rounding from search to search: several of them in float64
     with jax.enable_x64(precision == "float64"):
         fun, y0, args = problem(bars, (2, 29), (14, 20), precision)
         solver = sd.GaussNewton(jnp.asarray(3.0, precision), **SEARCHES if restarts else {})

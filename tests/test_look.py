@@ -49,6 +49,7 @@ def test_a_poor_minimum_is_left(call, solver, fun, seed):
     np.testing.assert_allclose(left.y, BASIN, atol=1e-3)
 
 
+@pytest.mark.slow
 @each
 def test_it_is_left_under_optimistix_too(call, solver, fun):
     run = optx.minimise if call is sd.minimise else optx.least_squares
@@ -147,6 +148,7 @@ def test_failures_elsewhere_end_nothing(call, solver, fun):
     np.testing.assert_allclose(result.y, DIP, atol=0.01)
 
 
+@pytest.mark.slow
 @each
 def test_several_points_at_once(call, solver, fun):
     result = call(
