@@ -15,7 +15,7 @@ from smoothdiff._params import as_key, layout_of
 from smoothdiff._run import inexact
 from smoothdiff._solvers import AbstractSmoothSolver
 from smoothdiff._solvers._base import write_options
-from smoothdiff._solvers._look import bounds_of
+from smoothdiff._solvers._box import bounds_of
 from smoothdiff._solvers._point_search import LOOK, TRUST
 from smoothdiff._unit_space import UnitSpace
 

@@ -10,31 +10,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
+from smoothdiff._solvers._box import bounds_of
 
 # the seeds of the samples of a search are so many: each look and each search after one has others
 _SEEDS = 2**16
-
-
-def bounded(params: Params) -> bool:
-    """Whether there are bounds to both sides, open or not."""
-    return params.low is not None and params.high is not None
-
-
-def bounds_of(params: Params) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Those of parameters that are `bounded`."""
-    if params.low is None or params.high is None:
-        raise ValueError("this goes from bound to bound: give bounds")
-    return params.low, params.high
-
-
-def closed(params: Params) -> Bool[Array, ""]:
-    """Whether all of these bounds are finite."""
-    return jnp.all(jnp.isfinite(jnp.stack(bounds_of(params))))
-
-
-def length(n: int) -> int:
-    """How many points a look takes: as many as a first quadratic model."""
-    return 2 * n + 1
 
 
 class Look(eqx.Module):
@@ -56,6 +35,11 @@ class Look(eqx.Module):
         none = jnp.zeros((), jnp.int32)
         return Look(none, jnp.asarray(False), jnp.asarray(jnp.inf, like.dtype), none, none)
 
+    @staticmethod
+    def length(n: int) -> int:
+        """How many points it takes, of n parameters: as many as a first quadratic model."""
+        return 2 * n + 1
+
     def begun(self, before: Float[Array, ""], follows: Int[Array, ""]) -> "Look":
         """Before its first point."""
         return Look(jnp.zeros_like(self.taken), self.done, before, follows, self.found)
@@ -63,7 +47,7 @@ class Look(eqx.Module):
     def more(self, count: int, n: int) -> "Look":
         """With so many points, of n parameters."""
         taken = self.taken + count
-        changed = taken, self.done | (taken >= length(n))
+        changed = taken, self.done | (taken >= self.length(n))
         return eqx.tree_at(lambda k: (k.taken, k.done), self, changed)
 
     def again(self) -> "Look":

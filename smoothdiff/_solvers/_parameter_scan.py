@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
-from smoothdiff._solvers._look import closed
+from smoothdiff._solvers._box import closed
 
 # evaluations along a parameter: in the try of the first parameters, in a first scan, and the most
 _TRY, _FIRST, _MOST = 16, 50, 200

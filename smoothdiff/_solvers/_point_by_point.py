@@ -21,10 +21,11 @@ from smoothdiff._solvers._base import (
     read_options,
     smoothed_params,
 )
+from smoothdiff._solvers._box import bounded
 from smoothdiff._solvers._evaluator import Evaluator, objectives
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import Values, judged, judging
-from smoothdiff._solvers._look import Look, bounded
+from smoothdiff._solvers._look import Look
 from smoothdiff._solvers._point_search import AbstractPointSearch, Sizes, where
 from smoothdiff._solvers._random_numbers import in_step, takes_key
 from smoothdiff._solvers._ratio_test import taken_by_rounding

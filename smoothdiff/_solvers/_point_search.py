@@ -12,8 +12,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
 from smoothdiff._solvers._averaging import Average
+from smoothdiff._solvers._box import closed
 from smoothdiff._solvers._history import History, alike
-from smoothdiff._solvers._look import Look, closed
+from smoothdiff._solvers._look import Look
 from smoothdiff._solvers._pilot import PAIRS, Pilot
 from smoothdiff._solvers._ratio_test import is_lower
 

@@ -18,7 +18,6 @@ from jaxtyping import Array, Bool, Float, Int
 from smoothdiff._params import Params
 from smoothdiff._solvers._first_points import FirstPoints
 from smoothdiff._solvers._history import History, alike
-from smoothdiff._solvers._look import length
 from smoothdiff._solvers._pilot import Pilot
 from smoothdiff._solvers._point_search import (
     FIRST,
@@ -206,7 +205,7 @@ class ResidualSearch(AbstractPointSearch):
         pilot = lambda: (self.pilot_points(params, draw, count), nothing)
         branches = [first, local, wide, pilot]
         if (look := self.look) is not None:
-            branches.append(lambda: (look.points(params, draw(length(n)), count), nothing))
+            branches.append(lambda: (look.points(params, draw(look.length(n)), count), nothing))
         return by_stage(self.stage, stage, branches)
 
     def after(

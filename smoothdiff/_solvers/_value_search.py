@@ -16,9 +16,9 @@ from jaxtyping import Array, Bool, Float
 
 from smoothdiff._params import Params
 from smoothdiff._solvers._base import all_finite
+from smoothdiff._solvers._box import bounds_of
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import differ
-from smoothdiff._solvers._look import bounds_of, length
 from smoothdiff._solvers._parameter_scan import Scan
 from smoothdiff._solvers._point_search import (
     FIRST,
@@ -90,7 +90,7 @@ class ValueSearch(ValueState):
         further = lambda: (self.pilot_points(params, draw, count), nothing)
         branches = [first, local, wide, further]
         if (look := self.look) is not None:
-            branches.append(lambda: (look.points(params, draw(length(n)), count), nothing))
+            branches.append(lambda: (look.points(params, draw(look.length(n)), count), nothing))
         if (scan := self.scan) is not None:
             branches.append(lambda: (scan.propose(*bounds_of(params), count), nothing))
         return by_stage(self.stage, stage, branches)

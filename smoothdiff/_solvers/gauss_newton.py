@@ -61,8 +61,8 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     have found nothing lower.
 
     Within finite bounds a search that would end with more than a tenth of the loss of its start
-    looks at 2n + 1 points spread over all of the box, which may be not finite. If one is lower, it
-    begins there anew. Among `restarts` only the first does.
+    looks at 2n + 1 points spread over all of the box. Where one is lower, it begins anew. A value
+    that is not finite ends nothing there. Searches that `restarts` add do not look.
 
     With 100 parameters and more, or with a schedule of sigma, each step takes a batch, and there is
     the wide regression alone. A batch may say little about each of so many parameters. Then 12 of

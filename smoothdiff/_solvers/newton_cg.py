@@ -15,10 +15,10 @@ from smoothdiff._params import layout_of
 from smoothdiff._samplers import AbstractSampler
 from smoothdiff._solvers import _newton_batches, _point_by_point
 from smoothdiff._solvers._base import AbstractSmoothSolver, check_settings, smoothed_params, stopped
+from smoothdiff._solvers._box import bounded
 from smoothdiff._solvers._evaluator import Evaluator
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import by_rows
-from smoothdiff._solvers._look import bounded
 from smoothdiff._solvers._parameter_scan import Scan
 from smoothdiff._solvers._point_search import Sizes
 from smoothdiff._solvers._value_search import ValueSearch
@@ -61,8 +61,8 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     the wide model alone.
 
     Within finite bounds a search that would end looks at 2n + 1 points spread over all of the box.
-    They may be not finite. If one is lower, it begins there anew. Among `restarts` only the first
-    search does.
+    Where one is lower, it begins anew. A value that is not finite ends nothing there. Searches that
+    `restarts` add do not look.
 
     Bounds are never left. A sample beyond them is clamped or, where that would throw it out of a
     narrow valley, pulled back along its ray, and the models take it where it was evaluated.
