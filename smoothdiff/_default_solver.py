@@ -23,12 +23,15 @@ from smoothdiff._solvers._base import sigma_at
 from smoothdiff._spaces import SIGMA
 from smoothdiff._support import MovingSupport, as_support
 
-# sigma as a share of the largest number of a leaf whose parameters have no range
-_SHARE = 0.2
+# sigma as a share of the scale of a parameter without a range; the next larger number has the same
+# units if it is no more than so many times as large
+_SHARE, _ALIKE = 0.2, 10.0
 # and of a range for residuals that are evaluated point by point: first points far apart tell most
 _WIDE = 0.4
 # a step of Adam, in sigmas
 _RATE = 0.15
+# what fails is left out: nobody chose where the points are
+_DROPS = {"nonfinite": "drop"}
 # so many parameters on a term, in the mean, can be searched for by themselves
 _FEW = 10
 
@@ -65,19 +68,19 @@ def default_solver(
             sigma = jax.tree.map(lambda s, d: d if s is None else s, full, usual, is_leaf=_is_none)
     if residuals:
         if support is None:
-            return GaussNewton(sigma)
+            return GaussNewton(sigma, **_DROPS)
         if anywhere and _all_bounded(y, bounds) and _few_on_a_term(y, support):
-            return LocalCrossEntropy(support)
-        return LocalGaussNewton(sigma, support)
+            return LocalCrossEntropy(support, **_DROPS)
+        return LocalGaussNewton(sigma, support, **_DROPS)
     # with more parameters a quadratic model takes too many evaluations
     if NewtonCG(1.0).sizes(y) is not None:
-        return NewtonCG(sigma)
+        return NewtonCG(sigma, **_DROPS)
     optim = optax.chain(optax.scale_by_adam(), _in_sigmas(sigma))
-    return FirstOrder(optim, sigma, adaptive=not callable(sigma))
+    return FirstOrder(optim, sigma, adaptive=not callable(sigma), **_DROPS)
 
 
 def _usual(y: PyTree[Array], bounds: tuple[PyTree, PyTree] | None, share: float) -> PyTree[Array]:
-    """A share of each range; without one a fifth of the largest number of the leaf, or 0.2."""
+    """A share of each range; without one a fifth of the parameter's scale."""
     leaves, treedef = jax.tree.flatten(y)
     return treedef.unflatten(map(partial(_width, share), leaves, *_sides(y, bounds)))
 
@@ -131,9 +134,23 @@ def _in_sigmas(sigma: PyTree) -> optax.GradientTransformation:
 
 
 def _width(share: float, leaf: Array, low: Any, high: Any) -> Array:
-    size = float(np.max(np.abs(np.asarray(leaf)), initial=0.0)) or 1.0
-    width = jnp.full(leaf.shape, _SHARE * size, leaf.dtype)
+    width = jnp.asarray(_SHARE * _sizes(np.asarray(leaf, float)), leaf.dtype)
     if low is None or high is None:
         return width
     span = jnp.broadcast_to(jnp.asarray(high) - jnp.asarray(low), leaf.shape).astype(leaf.dtype)
     return jnp.where(jnp.isfinite(span) & (span > 0), share * span, width)
+
+
+def _sizes(leaf: np.ndarray) -> np.ndarray:
+    """The scale of each number: the largest of those that may have the same units.
+
+    Sorted, they have where none is more than ten times the one before. A zero has the geometric
+    mean of all others, or 1.
+    """
+    sizes = np.abs(leaf)
+    some = np.sort(sizes[sizes > 0])
+    if not len(some):
+        return np.ones_like(sizes)
+    largest = np.append(np.flatnonzero(some[1:] > _ALIKE * some[:-1]), len(some) - 1)
+    group = np.searchsorted(some[largest], sizes)
+    return np.where(sizes > 0, some[largest[group]], np.exp(np.mean(np.log(some))))

@@ -59,11 +59,15 @@ def minimise(
     $$ \min_y F(y), \qquad F(y) = \mathbb{E}_z[f(y + \sigma z, \text{args})] $$
 
     The default solver is `NewtonCG(sigma)`, and from 100 parameters on `FirstOrder` with Adam,
-    whose steps are 0.15 sigma, `adaptive` unless sigma is a schedule. The default sigma is a fifth
-    of a parameter's range. A parameter without one gets a fifth of the largest number of its leaf
-    of y0, or 0.2 if that is zero. For both the order of magnitude will do. If all first points of
-    `NewtonCG` have the same value, it looks up to a thousand sigma away; where it finds a change,
-    it takes the first points again.
+    whose steps are 0.15 sigma, `adaptive` unless sigma is a schedule. Default solvers have
+    `nonfinite="drop"`: they leave out values that are not finite, unless they are too many.
+
+    The default sigma is a fifth of a parameter's range, or without one a fifth of its start; the
+    order of magnitude will do. Numbers of a leaf of y0 that may have the same units share the
+    largest of them: those of which, sorted, none is more than ten times the one before. A zero has
+    the geometric mean of the others of its leaf. If all are zero, sigma is 0.2. If all first points
+    of `NewtonCG` have the same value, or hardly differ beyond rounding, it looks up to a thousand
+    sigma away; where it finds a change, it takes the first points again.
 
     But for rounding, the iterates are those of `optimistix.minimise(fun, solver, y0, args,
     options={"key": key})`, with `"bounds": bounds` in the options if there are any.
@@ -118,7 +122,7 @@ def minimise(
         A `Result`.
 
     Raises:
-        MinimiseError: a black box failed, or an estimate was NaN or infinite. Nothing is lost: its
+        MinimiseError: a black box failed, or too much was NaN or infinite. Nothing is lost: its
             `result` has what was found, and the checkpoint is written.
         TypeError, ValueError: an argument that cannot work; a checkpoint of another problem.
 
@@ -198,7 +202,7 @@ def least_squares(
         parameters it has their `covariance`, `parameter_errors` and `parameter_intervals`.
 
     Raises:
-        MinimiseError: a black box failed, or an estimate was NaN or infinite. Nothing is lost: its
+        MinimiseError: a black box failed, or too much was NaN or infinite. Nothing is lost: its
             `result` has what was found, and the checkpoint is written.
         TypeError, ValueError: an argument that cannot work; a checkpoint of another problem.
 

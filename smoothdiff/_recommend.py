@@ -5,7 +5,6 @@ import itertools
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -170,8 +169,6 @@ def recommend(
     if view.width > 1:
         wider = jax.tree.map(lambda s: s * view.width, solver.sigma)
         solver = default_solver(y, bounds, wider, squares)
-    if not view.finite or np.any(view.failed):
-        solver = eqx.tree_at(lambda s: s.nonfinite, solver, "drop")
     names = units.labels() if each else [f"direction {i}" for i in range(_DIRECTIONS)]
     seen, advice = _words(view, names, squares, n)
     limits = Limits.of(solver, y, None, None, None, None)
@@ -235,7 +232,7 @@ def _words(view: View, names: list[str], squares: bool, n: int) -> tuple[list[st
         advice.append(f"a larger sigma for {idle}; what never matters is better off in args")
     if np.any(view.failed):
         seen.append(f"values that are not finite along {_listed(names, view.failed)}")
-        advice.append('bounds, or nonfinite="drop", which this solver has')
+        advice.append("bounds within which they are; this solver leaves out what is not finite")
     strong, weak = np.argmax(effects), np.argmin(np.where(known, effects, np.inf))
     if effects[strong] > _SCALES * effects[weak] > 0:
         ratio = effects[strong] / effects[weak]

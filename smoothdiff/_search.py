@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -46,8 +45,8 @@ class Search:
         key: a random key.
         residuals: whether each point is told its residuals, of which half the sum of squares is
             minimised. If not, it is told one number.
-        solver: a `NewtonCG`, or with residuals a `GaussNewton`, for fewer than 100 parameters. The
-            default, as for `minimise`, has `nonfinite="drop"`, which failed evaluations need.
+        solver: a `NewtonCG`, or with residuals a `GaussNewton`, for fewer than 100 parameters. By
+            default as for `minimise`. Failed evaluations need `nonfinite="drop"`.
         sigma: of the default solver, as for `minimise`.
         space: as for `minimise`.
         bounds: as for `minimise`.
@@ -91,7 +90,6 @@ class Search:
         self._y = self._unit(y0)
         if solver is None:
             solver = default_solver(self._y, bounds, sigma, residuals)
-            solver = eqx.tree_at(lambda s: s.nonfinite, solver, "drop")
         if not isinstance(solver, AbstractSmoothSolver) or solver.sizes(self._y) is None:
             raise TypeError(
                 "a search evaluates point by point: give NewtonCG, or GaussNewton with residuals, "

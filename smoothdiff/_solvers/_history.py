@@ -10,6 +10,8 @@ from smoothdiff._products import dot
 # a point takes the place of the iterate where that is so many times as high: of a little less the
 # noise of the function may be the reason
 _LOWER = 0.8
+# numbers that differ by so many roundings are hardly told apart
+_HARDLY = 64
 
 
 def alike(rows: Float[Array, "M P"], row: Float[Array, " P"]) -> Bool[Array, " M"]:
@@ -19,6 +21,13 @@ def alike(rows: Float[Array, "M P"], row: Float[Array, " P"]) -> Bool[Array, " M
     """
     ones = jnp.ones(rows.shape[1], rows.dtype)
     return dot(jnp.abs(rows - row[None]), ones) == 0
+
+
+def hardly_differ(rows: Float[Array, "M P"], row: Float[Array, " P"]) -> Bool[Array, " M"]:
+    """Which rows differ from this one so little that no slope can be told."""
+    little = _HARDLY * jnp.finfo(row.dtype).eps * jnp.abs(row)
+    beyond = jnp.maximum(jnp.abs(rows - row[None]) - little[None], 0)
+    return dot(beyond, jnp.ones_like(row)) == 0
 
 
 class History(eqx.Module):

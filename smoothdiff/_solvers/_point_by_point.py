@@ -139,14 +139,17 @@ class PointStep(eqx.Module):
         point, fun = lowest(points, jnp.where(good, funs, jnp.inf))
         lower = fun < progress.lowest_fun
         with promotion():
-            # of steps at several radii the first is that of the model
-            moved = solver.norm(params.layout.tree(points[0] - params.theta))
-            scale = jnp.maximum(solver.norm(self.y), solver.norm(params.layout.tree(params.sigma)))
+            # parameters in one array may have very different units
+            scale = jnp.maximum(jnp.abs(params.theta), params.sigma)
             rounding = math.sqrt(jnp.finfo(theta.dtype).eps) * scale
             # a model of residuals is not checked: it has not converged while the loss falls
             falls = progress.lowest_fun - fun > taken_by_rounding(progress.lowest_fun)
             least_move = jnp.where(falls & solver.squares, 0, rounding)
-            small = moved < jnp.maximum(solver.atol + solver.rtol * scale, least_move)
+            tolerance = jnp.maximum(solver.atol + solver.rtol * scale, least_move)
+            tiny = jnp.finfo(theta.dtype).tiny
+            # of steps at several radii the first is that of the model
+            moved = (points[0] - params.theta) / jnp.maximum(tolerance, tiny)
+            small = solver.norm(params.layout.tree(moved)) < 1
             # a point that only teaches the model is as long as the radius
             small |= after.right() & ~lower
             small &= (solver.rtol > 0) | (solver.atol > 0)

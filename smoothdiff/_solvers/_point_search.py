@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from smoothdiff._params import Params
 from smoothdiff._solvers._averaging import Average
 from smoothdiff._solvers._box import closed
-from smoothdiff._solvers._history import History, alike
+from smoothdiff._solvers._history import History, hardly_differ
 from smoothdiff._solvers._look import Look
 from smoothdiff._solvers._pilot import PAIRS, Pilot
 from smoothdiff._solvers._ratio_test import is_lower
@@ -190,23 +190,27 @@ class AbstractPointSearch(eqx.Module):
         return eqx.tree_at(lambda s: s.history, self, history)
 
     def enough(self, count: int) -> Bool[Array, ""]:
-        """Whether any of the last so many evaluations gave numbers, once there are so many."""
-        return (self.evaluated < count) | jnp.any(self.history.valid[-count:])
+        """Whether any of the last so many evaluations gave numbers, once there are so many.
+
+        First points may all fail but one: they come nearer.
+        """
+        begins = (self.stage == FIRST) & jnp.any(self.history.valid)
+        return (self.evaluated < count) | jnp.any(self.history.valid[-count:]) | begins
 
     def converged(self) -> Bool[Array, ""]:
         """Whether the last steps were small."""
         return self.small >= _SMALL
 
-    def plateau(self, reach: Float[Array, ""]) -> Bool[Array, ""]:
+    def plateau(self, reach: Float[Array, " n"]) -> Bool[Array, ""]:
         """Whether the function is the same as at the best point somewhere further than that."""
         point, _, fun = self.history.best(self.start)
-        away = jnp.max(jnp.abs(self.history.points - point[None]), axis=1)
-        return jnp.any(self.history.valid & (self.history.funs == fun) & (away > reach))
+        away = jnp.any(jnp.abs(self.history.points - point[None]) > reach[None], axis=1)
+        return jnp.any(self.history.valid & (self.history.funs == fun) & away)
 
     def piloting(self) -> Any:
         """With the pilot next, if the first points are over and all evaluations are the same."""
         rows, valid = self.history.rows, self.history.valid
-        same = jnp.all(alike(rows, rows[jnp.argmax(valid)]) | ~valid)
+        same = jnp.all(hardly_differ(rows, rows[jnp.argmax(valid)]) | ~valid)
         stage = jnp.full_like(self.stage, PILOT)
         flat = eqx.tree_at(lambda s: (s.stage, s.pilot.follows), self, (stage, self.stage))
         return where(same & (self.stage != FIRST) & self.pilot.left(), flat, self)
@@ -221,7 +225,7 @@ class AbstractPointSearch(eqx.Module):
         """After these points of the pilot: the first points again, or what would have followed."""
         steps = (new.points - self.start[None]) / params.sigma[None]
         row = self.history.rows[jnp.argmax(self.history.valid)]
-        changed = ~alike(new.rows, row)
+        changed = ~hardly_differ(new.rows, row)
         pilot = self.pilot.after(steps, changed, new.valid)
         stage = jnp.where(pilot.left(), self.stage, pilot.follows)
         more = eqx.tree_at(lambda s: (s.stage, s.pilot), self, (stage, pilot))

@@ -38,11 +38,13 @@ class Center(eqx.Module):
         """Nothing is known, and the samples are as wide as the metric."""
         return Center(theta, theta, metric, Trust.start(theta.size, theta.dtype))
 
-    def moved(self, theta: Float[Array, " n"]) -> "Center":
-        """The same samples, around another point."""
+    def moved(self, theta: Float[Array, " n"], radius: Float[Array, ""]) -> "Center":
+        """The same samples, around another point, as wide as the radius if it is so far away."""
         trust = self.trust
+        length = jnp.linalg.norm(self.metric.into(theta - self.theta))
         still = jnp.zeros_like(trust.reduction), jnp.zeros_like(trust.stall)
-        trust = eqx.tree_at(lambda t: (t.reduction, t.stall), trust, still)
+        new = *still, jnp.maximum(trust.width, jnp.minimum(length, radius))
+        trust = eqx.tree_at(lambda t: (t.reduction, t.stall, t.width), trust, new)
         return Center(theta, theta, self.metric, trust)
 
     def lost(self, sizes: Sizes) -> Bool[Array, ""]:

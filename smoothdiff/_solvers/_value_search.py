@@ -36,12 +36,8 @@ from smoothdiff._solvers._value_state import ValueState
 
 # a first search is long after so many evaluations for each parameter, and one
 _LONG = 60
-# of so many later searches one begins at the start
-_PATIENT = 4
 # so many steps or evaluations that led nowhere are enough for any patience
 _ENOUGH = 2**24
-# the widths of later searches, in sigma, as powers of ten at random
-_NARROWEST, _WIDEST = -1.5, 0.3
 
 
 class ValueSearch(ValueState):
@@ -115,7 +111,8 @@ class ValueSearch(ValueState):
             enough = self.evaluated + sizes.step > 2 * len(self.start)
             stage = jnp.where(enough, TRUST, FIRST).astype(self.stage.dtype)
             turn = Turn.start(len(self.start), known.history.best(self.start)[2])
-            return eqx.tree_at(lambda s: (s.stage, s.turn), known, (stage, turn)).piloting()
+            over = eqx.tree_at(lambda s: (s.stage, s.turn), known, (stage, turn)).piloting()
+            return where(enough, known.narrowed(params, over, sizes), over)
 
         def local() -> "ValueSearch":
             trust = self.trust.revise(proposal, before, new.funs, new.valid)
@@ -187,7 +184,7 @@ class ValueSearch(ValueState):
         trust = where(revive, revived, self.trust)
         trust = where(local, trust, trust.retried())
         move = local & ((lower & ~little) | (self.rounds == 0))
-        center = where(move, self.center.moved(point), self.center)
+        center = where(move, self.center.moved(point, trust.radius), self.center)
         done = trust.failed(), center.lost(sizes)
         ours, theirs = where(local, *done), where(local, *done[::-1])
         following, other = turn.next(fun, len(self.start), (ours, theirs), stuck)

@@ -12,7 +12,7 @@ from smoothdiff._solvers._history import History
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._parameter_scan import Scan
 from smoothdiff._solvers._pilot import Pilot
-from smoothdiff._solvers._point_search import FIRST, SCAN, WIDE, AbstractPointSearch, Sizes
+from smoothdiff._solvers._point_search import FIRST, SCAN, WIDE, AbstractPointSearch, Sizes, where
 from smoothdiff._solvers._quadratic_trust import QuadraticTrust
 from smoothdiff._solvers._ratio_test import is_narrow, rounding_alone
 from smoothdiff._solvers._regression_step import Center
@@ -20,6 +20,8 @@ from smoothdiff._solvers._turns import Turn
 
 # of so many later searches one begins at the start
 _PATIENT = 4
+# points that fail come so much nearer, until they are so near, in sigma
+_NEARER, _NEAREST = 0.1, 1e-5
 # the widths of later searches, in sigma, as powers of ten at random
 _NARROWEST, _WIDEST = -1.5, 0.3
 
@@ -119,6 +121,23 @@ class ValueState(AbstractPointSearch):
     ) -> "ValueState":
         """With all first points again."""
         return self.anew(params, theta, params.sigma, width)
+
+    def narrowed(self, params: Params, over: "ValueState", sizes: Sizes) -> "ValueState":
+        """What is `over` if the first points tell of each parameter; else those again.
+
+        Where both of a parameter fail, they come nearer.
+        """
+        history, newest = self.history, self.evaluated + sizes.step
+        recent = jnp.arange(len(history.valid), dtype=jnp.int32) >= len(history.valid) - newest
+        moved, valid = history.points != self.start[None], history.valid[:, None]
+        told = jnp.any(moved & valid, axis=0)
+        failed = jnp.any(moved & ~valid & recent[:, None], axis=0) & ~told
+        steps = jnp.where(failed, _NEARER * self.steps, self.steps)
+        again = jnp.any(valid) & jnp.any(failed & (steps > _NEAREST * params.sigma))
+        anew = self.anew(params, self.start, steps, jnp.ones_like(steps[0]))
+        # the start is known
+        one = jnp.full_like(self.evaluated, 1 - sizes.step)
+        return where(again, eqx.tree_at(lambda s: s.evaluated, anew, one), over)
 
     def elsewhere(self, params: Params, theta: Float[Array, " n"]) -> "ValueState":
         """The same search from there."""

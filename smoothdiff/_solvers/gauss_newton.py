@@ -93,14 +93,14 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         nonfinite: "propagate" or "drop" samples with a NaN or an infinity in their residuals; a
             round that loses half of them is followed by a narrower one. The end of a step that is
             tried may be anything.
-        rtol: relative tolerance. The run has converged when three steps in a row are below
-            `atol + rtol * max(norm(y), norm(sigma))`, unless only the radius made them short, or
-            they failed where the model promised more than rounding may take. Where no step as long
-            as a hundredth of sigma was predicted, and more than a tenth of the first loss is left,
-            that may be a ripple's minimum: wide rounds look around first.
+        rtol: relative tolerance. The run has converged when three steps in a row are shorter than
+            the tolerance, for each parameter atol + rtol max(|y|, sigma), unless only the radius
+            made them short, or they failed where the model promised more than rounding may take.
+            Where no step as long as a hundredth of sigma was predicted, and more than a tenth of
+            the first loss is left, that may be a ripple's minimum: wide rounds look around first.
         atol: absolute tolerance. With both zero no run converges; else the tolerance is at least
-            the root of the rounding of `max(norm(y), norm(sigma))`.
-        norm: the norm of steps and iterates.
+            the root of the rounding of max(|y|, sigma).
+        norm: the norm of steps, in units of the tolerance.
         patience: how many evaluations in a row without a lower point end a search. By default
             20 (n + 1), and in the last search at least 100. With batches it counts steps, by
             default 30, and the last search goes on.

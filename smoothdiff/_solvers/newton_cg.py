@@ -81,16 +81,16 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         sampler: where to sample, one whose points are normal; by default `Sobol`.
         nonfinite: "propagate" a sample that is NaN or infinite, which ends the run with an error,
             or "drop" it.
-        rtol: relative tolerance. The run has converged when three steps in a row are below
-            `atol + rtol * max(norm(y), norm(sigma))`, unless only the radius made them short, or
-            they failed where the model promised more than rounding may take. After the first of
-            the three one evaluation checks the model; it must rise about as predicted. A point
-            counts as a small step if the model promises no more than rounding takes. If other
-            searches are to follow, a search goes on until its patience ends: its wide samples may
-            find more.
+        rtol: relative tolerance. The run has converged when three steps in a row are shorter than
+            the tolerance, for each parameter atol + rtol max(|y|, sigma), unless only the radius
+            made them short, or they failed where the model promised more than rounding may take.
+            After the first of the three one evaluation checks the model; it must rise about as
+            predicted. A point counts as a small step if the model promises no more than rounding
+            takes. If other searches are to follow, a search goes on until its patience ends: its
+            wide samples may find more.
         atol: absolute tolerance. With both zero no run converges; else the tolerance is at least
-            the root of the rounding of `max(norm(y), norm(sigma))`.
-        norm: the norm of steps and iterates.
+            the root of the rounding of max(|y|, sigma).
+        norm: the norm of steps, in units of the tolerance.
         patience: a search ends after so many evaluations in a row in which the wide model led
             nowhere, if the local one does not either; by default 20 (n + 1). Within a thousandth of
             sigma, so many without a lower point are enough, and a model is done at once where

@@ -3,6 +3,7 @@
 There is one black box for all functions of a shape, so that a solver is compiled once for each.
 """
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,25 +15,36 @@ import numpy as np
 
 import smoothdiff as sd
 from benchmarks.studies.profiles.runs import SEED, Method, Seen, Spent
+from smoothdiff._default_solver import default_solver
 
 ENDLESS = 2**31 - 1  # steps: what ends a run is the budget
 LIBRARY = Path(sd.__file__).parent
-FILES = (Path(__file__), LIBRARY / "_run.py", *sorted(LIBRARY.glob("_solvers/*.py")))
+FILES = (
+    Path(__file__),
+    LIBRARY / "_run.py",
+    LIBRARY / "_default_solver.py",
+    *sorted(LIBRARY.glob("_solvers/*.py")),
+)
 SOURCE = "".join(path.read_text() for path in FILES)
 
 
 def gauss_newton(seen: Seen) -> None:
-    solver = sd.GaussNewton(jnp.asarray(seen.case.width), nonfinite="drop")
-    _run(sd.least_squares, seen, solver, max_steps=ENDLESS)
+    _run(sd.least_squares, seen, _default(seen, residuals=True), max_steps=ENDLESS)
 
 
 def newton_cg(seen: Seen) -> None:
-    solver = sd.NewtonCG(jnp.asarray(seen.case.width), nonfinite="drop", restarts=100)
-    _run(sd.minimise, seen, solver, max_steps=ENDLESS)
+    solver = _default(seen, residuals=False)
+    _run(sd.minimise, seen, replace(solver, restarts=100), max_steps=ENDLESS)
 
 
 def shortest_call(seen: Seen) -> None:
     _run(sd.minimise, seen, None, max_evaluations=seen.budget)
+
+
+def _default(seen: Seen, residuals: bool) -> Any:
+    """The solver of the shortest call, with its sigma."""
+    start = jnp.asarray(seen.case.start)
+    return default_solver(start, seen.case.bounds, None, residuals)
 
 
 @cache

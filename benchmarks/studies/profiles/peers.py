@@ -1,4 +1,7 @@
-"""Those of other libraries, with their defaults; the first width and bounds are the problem's."""
+"""Those of other libraries, with their defaults; bounds and the first width are the problem's.
+
+That width is the default of DFO-LS and Py-BOBYQA, a tenth of the largest parameter.
+"""
 
 from functools import partial
 from inspect import getsource

@@ -1,0 +1,96 @@
+"""Parameters of very different units, and starts far too small: what a call without sigma finds."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import smoothdiff as sd
+from smoothdiff._default_solver import default_solver
+
+TIMES = jnp.linspace(0, 1, 30)
+UNITS = jnp.array([1e-6, 1.0, 1e3])
+FOUND = UNITS * jnp.array([3.0, 2.0, 0.5])
+calls = pytest.mark.parametrize(
+    "call", [sd.least_squares, sd.minimise], ids=["residuals", "number"]
+)
+
+
+def decay(y):
+    """A rate of about 1; amplitudes a million times smaller and a thousand times larger."""
+    return 1e6 * y[0] * jnp.exp(-y[1] * TIMES) + 1e-3 * y[2] * TIMES
+
+
+def solved(call, residuals, y0, **options):
+    """The result of a call, of residuals or of half the sum of their squares."""
+    value = lambda y, args: jnp.sum(residuals(y) ** 2) / 2
+    fun = value if call is sd.minimise else lambda y, args: residuals(y)
+    return call(fun, y0, key=jax.random.key(0), **options)
+
+
+def sigma_of(*numbers):
+    return np.asarray(default_solver(jnp.array(numbers), None, None, True).sigma)
+
+
+def test_numbers_of_one_order_share_the_largest():
+    np.testing.assert_allclose(sigma_of(3.0, -20.0, 150.0), 0.2 * 150, rtol=1e-6)
+    np.testing.assert_allclose(sigma_of(1e-6, 5e-6, -2.0), [1e-6, 1e-6, 0.4], rtol=1e-6)
+
+
+def test_a_zero_has_the_geometric_mean_of_the_others():
+    np.testing.assert_allclose(sigma_of(0.0, 1.0, 100.0), [2.0, 0.2, 20.0], rtol=1e-6)
+    np.testing.assert_allclose(sigma_of(0.0, 0.0), 0.2, rtol=1e-6)
+
+
+def test_a_parameter_with_a_range_has_a_share_of_that():
+    bounds = jnp.array([0.0, -jnp.inf]), jnp.array([10.0, jnp.inf])
+    solver = default_solver(jnp.array([1e-3, 50.0]), bounds, None, False)
+    np.testing.assert_allclose(solver.sigma, [2.0, 10.0], rtol=1e-6)
+
+
+@calls
+@pytest.mark.parametrize("third", [100.0, 1000.0])
+def test_one_array_may_hold_very_different_units(call, third):
+    residuals = lambda y: decay(y) - decay(FOUND)
+    result = solved(call, residuals, jnp.array([1e-6, 1.0, third]))
+    np.testing.assert_allclose(result.y / FOUND, 1, atol=2e-3)
+
+
+@calls
+def test_steps_are_small_in_each_parameter_before_a_run_has_converged(call):
+    """Steps of the largest alone would have been small from the beginning."""
+    residuals = lambda y: decay(y) - decay(FOUND)
+    result = solved(call, residuals, UNITS, sigma=0.1 * UNITS)
+    np.testing.assert_allclose(result.y / FOUND, 1, atol=2e-3)
+
+
+@calls
+@pytest.mark.parametrize("size", [1e-7, 1e-4])
+def test_a_start_far_too_small_is_no_answer(call, size):
+    """One sigma away from it, values of float32 hardly differ, or the curvature is rounding."""
+    residuals = lambda y: y - jnp.array([1.0, 2.0, 3.0])
+    result = solved(call, residuals, jnp.full(3, size))
+    assert result.reason == "converged"
+    np.testing.assert_allclose(result.y, [1, 2, 3], atol=2e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [1e-6, 1e-4, 1e-2])
+def test_a_valley_is_followed_from_there(size):
+    valley = lambda y: jnp.stack([10 * (y[1] - y[0] ** 2), 1 - y[0], y[2] - y[1]])
+    result = solved(sd.minimise, valley, jnp.full(3, size))
+    assert result.fun < 1e-8
+
+
+@calls
+def test_points_that_nobody_chose_may_fail(call):
+    """One sigma from the start, and wherever a step is too long, there is no number."""
+    wall = lambda y: jnp.where(jnp.all(jnp.abs(y - 1) < 0.1), 30 * (y - 1.05), jnp.nan)
+    result = solved(call, wall, jnp.ones(2))
+    np.testing.assert_allclose(result.y, 1.05, atol=2e-3)
+
+
+@calls
+def test_a_function_that_always_fails_is_an_error(call):
+    with pytest.raises(sd.MinimiseError, match="begin where fun is finite"):
+        solved(call, lambda y: jnp.full(3, jnp.nan) * y[0], jnp.ones(2))
