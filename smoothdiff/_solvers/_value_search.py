@@ -184,7 +184,9 @@ class ValueSearch(ValueState):
         trust = where(revive, revived, self.trust)
         trust = where(local, trust, trust.retried())
         move = local & ((lower & ~little) | (self.rounds == 0))
-        center = where(move, self.center.moved(point, trust.radius), self.center)
+        # where the local model went far, wide samples are as wide as it is trusted there
+        radius = jnp.where(lower, trust.radius, 0)
+        center = where(move, self.center.moved(point, radius), self.center)
         done = trust.failed(), center.lost(sizes)
         ours, theirs = where(local, *done), where(local, *done[::-1])
         following, other = turn.next(fun, len(self.start), (ours, theirs), stuck)
