@@ -94,3 +94,11 @@ def test_points_that_nobody_chose_may_fail(call):
 def test_a_function_that_always_fails_is_an_error(call):
     with pytest.raises(sd.MinimiseError, match="begin where fun is finite"):
         solved(call, lambda y: jnp.full(3, jnp.nan) * y[0], jnp.ones(2))
+
+
+@pytest.mark.parametrize("y0", [(0.1, 5.0, 30.0), (2.0, 5.0, 30.0)])
+def test_samples_come_nearer_where_most_of_them_fail(y0):
+    barrier = lambda y, args: jnp.sum(y - jnp.log(y))
+    result = sd.minimise(barrier, jnp.array(y0), key=jax.random.key(0))
+    assert result.reason == "converged"
+    np.testing.assert_allclose(result.y, 1, atol=5e-3)

@@ -23,6 +23,8 @@ from smoothdiff._solvers._ratio_test import is_lower
 FIRST, TRUST, WIDE, PILOT, LOOK, SCAN = 0, 1, 2, 3, 4, 5
 # so many small steps in a row count as convergence
 _SMALL = 3
+# so many times as many evaluations may fail if samples come nearer to where the function is finite
+_COMING = 4
 # a width of so many roundings of sigma is nothing
 _NOTHING = 32
 
@@ -192,10 +194,13 @@ class AbstractPointSearch(eqx.Module):
     def enough(self, count: int) -> Bool[Array, ""]:
         """Whether any of the last so many evaluations gave numbers, once there are so many.
 
-        First points may all fail but one: they come nearer.
+        Where there are numbers elsewhere, more may fail, as they come nearer.
         """
-        begins = (self.stage == FIRST) & jnp.any(self.history.valid)
-        return (self.evaluated < count) | jnp.any(self.history.valid[-count:]) | begins
+        valid = self.history.valid
+        known = jnp.any(valid)
+        first = (self.stage == FIRST) & known
+        lately = jnp.any(valid[-count:]) | (known & jnp.any(valid[-_COMING * count :]))
+        return (self.evaluated < count) | lately | first
 
     def converged(self) -> Bool[Array, ""]:
         """Whether the last steps were small."""

@@ -32,7 +32,7 @@ from smoothdiff._solvers._point_search import (
 from smoothdiff._solvers._quadratic_trust import Proposal
 from smoothdiff._solvers._ratio_test import are_level, is_lower
 from smoothdiff._solvers._turns import Turn
-from smoothdiff._solvers._value_state import ValueState
+from smoothdiff._solvers._value_state import NEARER, ValueState
 
 # a first search is long after so many evaluations for each parameter, and one
 _LONG = 60
@@ -161,7 +161,11 @@ class ValueSearch(ValueState):
         stall = jnp.where(
             self.at_bottom(sizes, self.center.trust.width), _ENOUGH, center.trust.stall
         )
-        center = eqx.tree_at(lambda c: c.trust.stall, center, stall)
+        # where most samples gave no numbers they were too far away
+        some = jnp.sum(self.last(sizes)[1])
+        nearer = self.center.trust.width * jnp.where(some > 0, 0.5, NEARER)
+        width = jnp.where(2 * some < sizes.first, nearer, center.trust.width)
+        center = eqx.tree_at(lambda c: (c.trust.stall, c.trust.width), center, (stall, width))
         new = center, jnp.zeros_like(self.taken), self.rounds + 1
         after = eqx.tree_at(lambda s: (s.center, s.taken, s.rounds), self, new)
         return after if average is None else after.with_mean(average.after(center.theta))

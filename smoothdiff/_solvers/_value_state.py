@@ -21,7 +21,7 @@ from smoothdiff._solvers._turns import Turn
 # of so many later searches one begins at the start
 _PATIENT = 4
 # points that fail come so much nearer, until they are so near, in sigma
-_NEARER, _NEAREST = 0.1, 1e-5
+NEARER, _NEAREST = 0.1, 1e-5
 # the widths of later searches, in sigma, as powers of ten at random
 _NARROWEST, _WIDEST = -1.5, 0.3
 
@@ -132,7 +132,7 @@ class ValueState(AbstractPointSearch):
         moved, valid = history.points != self.start[None], history.valid[:, None]
         told = jnp.any(moved & valid, axis=0)
         failed = jnp.any(moved & ~valid & recent[:, None], axis=0) & ~told
-        steps = jnp.where(failed, _NEARER * self.steps, self.steps)
+        steps = jnp.where(failed, NEARER * self.steps, self.steps)
         again = jnp.any(valid) & jnp.any(failed & (steps > _NEAREST * params.sigma))
         anew = self.anew(params, self.start, steps, jnp.ones_like(steps[0]))
         # the start is known
