@@ -70,7 +70,9 @@ class HostProblem(Problem):
         """Of the evaluations for the judgement, those that a function without noise leaves."""
         if takes_key(self.options):
             return 0
-        return self.solver.final_evaluations(y) - 2 - len(state.search.candidates())
+        start = state.search.start
+        others = len(state.search.candidates(start, start))
+        return self.solver.final_evaluations(y) - 2 - others
 
     def trial(self, y: PyTree, state: PointState) -> Trial:
         """The lowest point once more."""

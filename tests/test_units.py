@@ -102,3 +102,17 @@ def test_samples_come_nearer_where_most_of_them_fail(y0):
     result = sd.minimise(barrier, jnp.array(y0), key=jax.random.key(0))
     assert result.reason == "converged"
     np.testing.assert_allclose(result.y, 1, atol=5e-3)
+
+
+@pytest.mark.parametrize("bounds", [None, (-10.0, 10.0)])
+def test_parameters_that_change_nothing_stay_where_they_were(bounds):
+    one_of_three = lambda y, args: (y[0] - 3) ** 2 + 1
+    result = sd.minimise(one_of_three, jnp.ones(3), key=jax.random.key(0), bounds=bounds)
+    np.testing.assert_allclose(result.y[0], 3, atol=2e-3)
+    np.testing.assert_array_equal(result.y[1:], 1)
+
+
+def test_a_parameter_may_change_nothing_at_the_start_alone():
+    hidden = lambda y, args: (y[0] - 3) ** 2 + jnp.where(y[0] > 2, (y[1] - 5) ** 2, 30.0)
+    result = sd.minimise(hidden, jnp.ones(2), key=jax.random.key(0))
+    np.testing.assert_allclose(result.y, [3, 5], atol=5e-3)

@@ -148,7 +148,8 @@ class PointStep(eqx.Module):
             tolerance = jnp.maximum(solver.atol + solver.rtol * scale, least_move)
             tiny = jnp.finfo(theta.dtype).tiny
             # of steps at several radii the first is that of the model
-            moved = (points[0] - params.theta) / jnp.maximum(tolerance, tiny)
+            moved = after.telling(points[0] - params.theta, lower)
+            moved = moved / jnp.maximum(tolerance, tiny)
             small = solver.norm(params.layout.tree(moved)) < 1
             # a point that only teaches the model is as long as the radius
             small |= after.right() & ~lower
@@ -255,7 +256,9 @@ class PointStep(eqx.Module):
             smoothed = progress.lowest_fun + search.smoothing()
             return smoothed, unknown, Seen(y, jnp.full_like(unknown, jnp.inf))
 
-        new = [params.layout.tree(params.clip(theta)) for theta in search.candidates()]
+        lowest_theta = params.layout.vector(jax.tree.leaves(progress.lowest_y))
+        others = search.candidates(params.theta, lowest_theta)
+        new = [params.layout.tree(params.clip(theta)) for theta in others]
         # with a key, the lowest of all is no higher than the start by the same numbers
         old = [] if values.takes_key else [progress.start_y]
         return judged(progress, values, estimate, 0, new, old, loop)

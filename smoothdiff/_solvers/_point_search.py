@@ -143,8 +143,17 @@ class AbstractPointSearch(eqx.Module):
     def smoothing(self) -> Float[Array, ""]:
         """What smoothing adds to the function at the iterate, by the model."""
 
-    def candidates(self) -> list[Float[Array, " n"]]:
-        """What may be better than the lowest point, but was not evaluated."""
+    def telling(self, step: Float[Array, " n"], lower: Bool[Array, ""]) -> Float[Array, " n"]:
+        """What of a step says whether it is small."""
+        return step
+
+    def candidates(
+        self, start: Float[Array, " n"], lowest: Float[Array, " n"]
+    ) -> list[Float[Array, " n"]]:
+        """What may be better than the lowest point, but was not evaluated; the run had that start.
+
+        Of equals these are the answer.
+        """
         return [] if self.average is None else [self.iterate()]
 
     @abc.abstractmethod

@@ -111,7 +111,8 @@ class ValueSearch(ValueState):
             enough = self.evaluated + sizes.step > 2 * len(self.start)
             stage = jnp.where(enough, TRUST, FIRST).astype(self.stage.dtype)
             turn = Turn.start(len(self.start), known.history.best(self.start)[2])
-            over = eqx.tree_at(lambda s: (s.stage, s.turn), known, (stage, turn)).piloting()
+            over = eqx.tree_at(lambda s: (s.stage, s.turn), known, (stage, turn))
+            over = where(enough, over.compared(), over).piloting()
             return where(enough, known.narrowed(params, over, sizes), over)
 
         def local() -> "ValueSearch":

@@ -36,7 +36,8 @@ class ValueState(AbstractPointSearch):
     lowest sample: what is lowest by chance does not lead it away from where the smoothed function
     is low. Nor does any search where the function is `noisy`: where it gave another value for the
     same point, which the first round of samples begins with. `idle` counts the evaluations that
-    lowered its lowest value by no more than rounding.
+    lowered its lowest value by no more than rounding. Parameters are `unchanging` whose first
+    points had the value of the start.
     """
 
     steps: Float[Array, " n"]
@@ -44,6 +45,7 @@ class ValueState(AbstractPointSearch):
     searches: Int[Array, ""]
     idle: Int[Array, ""]
     noisy: Bool[Array, ""]
+    unchanging: Bool[Array, " n"]
     trust: QuadraticTrust
     place: Float[Array, " n"]
     center: Center
@@ -80,6 +82,7 @@ class ValueState(AbstractPointSearch):
             searches=none,
             idle=none,
             noisy=jnp.asarray(False),
+            unchanging=jnp.zeros(n, bool),
             trust=QuadraticTrust.start(sigma, width),
             place=theta,
             center=center,
@@ -112,7 +115,7 @@ class ValueState(AbstractPointSearch):
             anew = dataclasses.replace(anew, scan=scan)
             stage = jnp.where(scans, SCAN, stage).astype(stage.dtype)
         # its place is as good as that of a look, of which there is no other
-        anew = dataclasses.replace(anew, look=self.look)
+        anew = dataclasses.replace(anew, look=self.look, unchanging=self.unchanging)
         changed = stage, self.rounds + 1, searches, self.noisy
         return eqx.tree_at(lambda s: (s.stage, s.rounds, s.searches, s.noisy), anew, changed)
 
@@ -121,6 +124,16 @@ class ValueState(AbstractPointSearch):
     ) -> "ValueState":
         """With all first points again."""
         return self.anew(params, theta, params.sigma, width)
+
+    def compared(self) -> "ValueState":
+        """With what the first points say of each parameter alone."""
+        history = self.history
+        moved = history.points != self.start[None]
+        here = history.valid & ~jnp.any(moved, axis=1)
+        fun = jnp.max(jnp.where(here, history.funs, -jnp.inf))
+        alone = (history.valid & (jnp.sum(moved, axis=1) == 1))[:, None] & moved
+        changes = jnp.any(alone & (history.funs != fun)[:, None], axis=0)
+        return eqx.tree_at(lambda s: s.unchanging, self, jnp.any(alone, axis=0) & ~changes)
 
     def narrowed(self, params: Params, over: "ValueState", sizes: Sizes) -> "ValueState":
         """What is `over` if the first points tell of each parameter; else those again.
@@ -146,7 +159,7 @@ class ValueState(AbstractPointSearch):
 
     def anew(self, params: Params, theta: Array, sigma: Array, width: Array) -> "ValueState":
         """The same search from another point, with all that was evaluated."""
-        names = "pilot", "average", "look", "searches", "rounds", "noisy", "scan"
+        names = "pilot", "average", "look", "searches", "rounds", "noisy", "scan", "unchanging"
         anew = self.of(params, theta, sigma, width, self.history)
         return dataclasses.replace(anew, **{name: getattr(self, name) for name in names})
 
@@ -186,9 +199,21 @@ class ValueState(AbstractPointSearch):
         """The radius, or the width of the samples."""
         return jnp.where(self.stage == WIDE, self.center.trust.width, self.trust.radius)
 
-    def candidates(self) -> list[Float[Array, " n"]]:
-        """With noise, the lowest point owes much to luck, and the center little."""
-        return [self.center.theta] if self.average is None else super().candidates()
+    def telling(self, step: Float[Array, " n"], lower: Bool[Array, ""]) -> Float[Array, " n"]:
+        """Without parameters that change nothing, unless it led to a lower point."""
+        return jnp.where(self.unchanging & ~lower, 0, step)
+
+    def candidates(
+        self, start: Float[Array, " n"], lowest: Float[Array, " n"]
+    ) -> list[Float[Array, " n"]]:
+        """The lowest point, with parameters that changed nothing back at the start.
+
+        If there are none, the center: with noise the lowest point owes much to luck, it little.
+        """
+        if self.average is not None:
+            return super().candidates(start, lowest)
+        back = jnp.where(self.unchanging, start, lowest)
+        return [jnp.where(jnp.any(self.unchanging), back, self.center.theta)]
 
     def round(self) -> Int[Array, ""]:
         """So many rounds of samples."""
