@@ -30,8 +30,6 @@ _SHARE, _ALIKE = 0.2, 10.0
 _WIDE = 0.4
 # a step of Adam, in sigmas
 _RATE = 0.15
-# what fails is left out: nobody chose where the points are
-_DROPS = {"nonfinite": "drop"}
 # so many parameters on a term, in the mean, can be searched for by themselves
 _FEW = 10
 
@@ -54,7 +52,8 @@ def default_solver(
 ) -> Any:
     """The rule that `minimise` and `least_squares` state.
 
-    `anywhere` says that no sigma is the user's, who does not ask to look around the start.
+    `anywhere` says that no sigma is the user's, who does not ask to look around the start. What
+    fails is left out, as nobody chose where the points are.
     """
     usual = _usual(y, bounds, share_of_range(y, residuals, support))
     if sigma is None:
@@ -68,15 +67,15 @@ def default_solver(
             sigma = jax.tree.map(lambda s, d: d if s is None else s, full, usual, is_leaf=_is_none)
     if residuals:
         if support is None:
-            return GaussNewton(sigma, **_DROPS)
+            return GaussNewton(sigma, nonfinite="drop")
         if anywhere and _all_bounded(y, bounds) and _few_on_a_term(y, support):
-            return LocalCrossEntropy(support, **_DROPS)
-        return LocalGaussNewton(sigma, support, **_DROPS)
+            return LocalCrossEntropy(support, nonfinite="drop")
+        return LocalGaussNewton(sigma, support, nonfinite="drop")
     # with more parameters a quadratic model takes too many evaluations
     if NewtonCG(1.0).sizes(y) is not None:
-        return NewtonCG(sigma, **_DROPS)
+        return NewtonCG(sigma, nonfinite="drop")
     optim = optax.chain(optax.scale_by_adam(), _in_sigmas(sigma))
-    return FirstOrder(optim, sigma, adaptive=not callable(sigma), **_DROPS)
+    return FirstOrder(optim, sigma, adaptive=not callable(sigma), nonfinite="drop")
 
 
 def _usual(y: PyTree[Array], bounds: tuple[PyTree, PyTree] | None, share: float) -> PyTree[Array]:

@@ -23,8 +23,9 @@ from smoothdiff._solvers._base import smoothed_params
 from smoothdiff._solvers._evaluator import Evaluator
 from smoothdiff._solvers._judgement import Values, differ
 from smoothdiff._solvers._point_by_point import PointState, PointStep
-from smoothdiff._solvers._point_search import AbstractPointSearch, Sizes
+from smoothdiff._solvers._point_search import AbstractPointSearch
 from smoothdiff._solvers._random_numbers import in_round, takes_key
+from smoothdiff._solvers._stages import Sizes
 
 # with a history of fewer numbers a step is short, and compiling it well would take longer than all
 # of the steps

@@ -15,7 +15,7 @@ from smoothdiff._run import inexact
 from smoothdiff._solvers import AbstractSmoothSolver
 from smoothdiff._solvers._base import write_options
 from smoothdiff._solvers._box import bounds_of
-from smoothdiff._solvers._point_search import LOOK, TRUST
+from smoothdiff._solvers._stages import LOOK, TRUST
 from smoothdiff._unit_space import UnitSpace
 
 # a point is given out again once so many others were told, for each that is out, and some more

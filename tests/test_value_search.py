@@ -9,7 +9,7 @@ import pytest
 
 from smoothdiff._params import take_apart
 from smoothdiff._solvers._history import History
-from smoothdiff._solvers._point_search import TRUST, WIDE, Sizes
+from smoothdiff._solvers._stages import TRUST, WIDE, Sizes
 from smoothdiff._solvers._value_search import ValueSearch
 
 N = 2

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from smoothdiff._numbers import check_whole
 from smoothdiff._params import Params, as_key, take_apart
 from smoothdiff._seen import Seen
-from smoothdiff._solvers._point_search import Sizes
+from smoothdiff._solvers._stages import Sizes
 
 # optax and norms mix dtypes (Adam raises a float to an integer), whatever the user's setting
 promotion = partial(jax.numpy_dtype_promotion, "standard")

@@ -26,9 +26,10 @@ from smoothdiff._solvers._evaluator import Evaluator, objectives
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import Values, judged, judging
 from smoothdiff._solvers._look import Look
-from smoothdiff._solvers._point_search import AbstractPointSearch, Sizes, where
+from smoothdiff._solvers._point_search import AbstractPointSearch
 from smoothdiff._solvers._random_numbers import in_step, takes_key
 from smoothdiff._solvers._ratio_test import taken_by_rounding
+from smoothdiff._solvers._stages import Sizes, where
 
 # by default a search ends after so many evaluations for each parameter, and one, without a lower
 # point

@@ -2,11 +2,10 @@
 
 import abc
 import dataclasses
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -17,28 +16,14 @@ from smoothdiff._solvers._history import History, hardly_differ
 from smoothdiff._solvers._look import Look
 from smoothdiff._solvers._pilot import PAIRS, Pilot
 from smoothdiff._solvers._ratio_test import is_lower
+from smoothdiff._solvers._stages import FIRST, LOOK, PILOT, TRUST, Sizes, where
 
-# what is evaluated next: the first points, a step of the local model, samples around a center,
-# points further and further away, points anywhere within the bounds, or along a parameter
-FIRST, TRUST, WIDE, PILOT, LOOK, SCAN = 0, 1, 2, 3, 4, 5
 # so many small steps in a row count as convergence
 _SMALL = 3
 # so many times as many evaluations may fail if samples come nearer to where the function is finite
 _COMING = 4
 # a width of so many roundings of sigma is nothing
 _NOTHING = 32
-
-
-class Sizes(NamedTuple):
-    """Evaluations a step, and samples of a first wide round and of a later one.
-
-    After `patience` evaluations in a row without a lower point a search ends.
-    """
-
-    step: int
-    first: int
-    later: int
-    patience: int
 
 
 class AbstractPointSearch(eqx.Module):
@@ -302,18 +287,6 @@ class AbstractPointSearch(eqx.Module):
         """The best point; of a function that takes random numbers the mean, once there is one."""
         best, *_ = self.history.best(self.start)
         return best if self.average is None else self.average.over(best)
-
-
-def where(condition: Bool[Array, ""], a: Any, b: Any) -> Any:
-    """One of two pytrees; what is the same in both, such as the history, is not copied."""
-    return jax.tree.map(lambda a, b: a if a is b else jnp.where(condition, a, b), a, b)
-
-
-def by_stage(
-    stage: Int[Array, ""], known: int | None, branches: Sequence[Callable[[], Any]]
-) -> Any:
-    """What one of the branches gives: that of the stage, or of the stage that is `known`."""
-    return jax.lax.switch(stage, branches) if known is None else branches[known]()
 
 
 def powers_of_two(count: int, dtype: Any) -> Float[Array, " count"]:

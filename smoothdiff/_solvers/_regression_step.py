@@ -12,8 +12,9 @@ from smoothdiff._params import Params
 from smoothdiff._solvers._averaging import apart
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._noisy_step import Trust, outcome, propose, revise
-from smoothdiff._solvers._point_search import Sizes, nothing
+from smoothdiff._solvers._point_search import nothing
 from smoothdiff._solvers._scalar_fit import ScalarFit, fit
+from smoothdiff._solvers._stages import Sizes
 
 # how strongly the noise of the Hessian's eigenvalues counts in the metric
 _CAUTION = 6.0

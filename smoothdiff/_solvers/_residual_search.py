@@ -19,16 +19,9 @@ from smoothdiff._params import Params
 from smoothdiff._solvers._first_points import FirstPoints
 from smoothdiff._solvers._history import History, alike
 from smoothdiff._solvers._pilot import Pilot
-from smoothdiff._solvers._point_search import (
-    FIRST,
-    TRUST,
-    WIDE,
-    AbstractPointSearch,
-    Sizes,
-    by_stage,
-    where,
-)
+from smoothdiff._solvers._point_search import AbstractPointSearch
 from smoothdiff._solvers._residual_trust import Proposal, TrustRegion
+from smoothdiff._solvers._stages import FIRST, TRUST, WIDE, Sizes, by_stage, where
 from smoothdiff._solvers._wide_rounds import Wide, further, sides_of
 
 # evaluations of wide rounds since the last lower point, for each parameter, until the local model

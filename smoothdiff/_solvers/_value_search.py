@@ -20,17 +20,9 @@ from smoothdiff._solvers._box import bounds_of
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import differ
 from smoothdiff._solvers._parameter_scan import Scan
-from smoothdiff._solvers._point_search import (
-    FIRST,
-    SCAN,
-    TRUST,
-    WIDE,
-    Sizes,
-    by_stage,
-    where,
-)
 from smoothdiff._solvers._quadratic_trust import Proposal
 from smoothdiff._solvers._ratio_test import are_level, is_lower
+from smoothdiff._solvers._stages import FIRST, SCAN, TRUST, WIDE, Sizes, by_stage, where
 from smoothdiff._solvers._turns import Turn
 from smoothdiff._solvers._value_state import NEARER, ValueState
 

@@ -12,10 +12,11 @@ from smoothdiff._solvers._history import History
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._parameter_scan import Scan
 from smoothdiff._solvers._pilot import Pilot
-from smoothdiff._solvers._point_search import FIRST, SCAN, WIDE, AbstractPointSearch, Sizes, where
+from smoothdiff._solvers._point_search import AbstractPointSearch
 from smoothdiff._solvers._quadratic_trust import QuadraticTrust
 from smoothdiff._solvers._ratio_test import is_narrow, rounding_alone
 from smoothdiff._solvers._regression_step import Center
+from smoothdiff._solvers._stages import FIRST, SCAN, WIDE, Sizes, where
 from smoothdiff._solvers._turns import Turn
 
 # of so many later searches one begins at the start

@@ -19,9 +19,9 @@ from smoothdiff._solvers._base import AbstractSmoothSolver, check_settings, smoo
 from smoothdiff._solvers._evaluator import Evaluator
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import by_rows
-from smoothdiff._solvers._point_search import Sizes
 from smoothdiff._solvers._residual_batch import check_residuals
 from smoothdiff._solvers._residual_search import ResidualSearch
+from smoothdiff._solvers._stages import Sizes
 
 # the default patience of the only search is at least so much, as a plateau may be wide
 _LAST = 100

@@ -20,7 +20,7 @@ from smoothdiff._solvers._evaluator import Evaluator
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import by_rows
 from smoothdiff._solvers._parameter_scan import Scan
-from smoothdiff._solvers._point_search import Sizes
+from smoothdiff._solvers._stages import Sizes
 from smoothdiff._solvers._value_search import ValueSearch
 
 # from so many parameters on, evaluations come in batches

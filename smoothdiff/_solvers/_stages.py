@@ -1,0 +1,36 @@
+"""The stages of a search: what is evaluated next, and how many at once."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+# what is evaluated next: the first points, a step of the local model, samples around a center,
+# points further and further away, points anywhere within the bounds, or along a parameter
+FIRST, TRUST, WIDE, PILOT, LOOK, SCAN = 0, 1, 2, 3, 4, 5
+
+
+class Sizes(NamedTuple):
+    """Evaluations a step, and samples of a first wide round and of a later one.
+
+    After `patience` evaluations in a row without a lower point a search ends.
+    """
+
+    step: int
+    first: int
+    later: int
+    patience: int
+
+
+def where(condition: Bool[Array, ""], a: Any, b: Any) -> Any:
+    """One of two pytrees; what is the same in both, such as the history, is not copied."""
+    return jax.tree.map(lambda a, b: a if a is b else jnp.where(condition, a, b), a, b)
+
+
+def by_stage(
+    stage: Int[Array, ""], known: int | None, branches: Sequence[Callable[[], Any]]
+) -> Any:
+    """What one of the branches gives: that of the stage, or of the stage that is `known`."""
+    return jax.lax.switch(stage, branches) if known is None else branches[known]()
