@@ -133,7 +133,7 @@ def _in_sigmas(sigma: PyTree) -> optax.GradientTransformation:
 
 
 def _width(share: float, leaf: Array, low: Any, high: Any) -> Array:
-    width = jnp.asarray(_SHARE * _sizes(np.asarray(leaf, float)), leaf.dtype)
+    width = jnp.asarray(_SHARE * _sizes(np.asarray(leaf)), leaf.dtype)
     if low is None or high is None:
         return width
     span = jnp.broadcast_to(jnp.asarray(high) - jnp.asarray(low), leaf.shape).astype(leaf.dtype)
@@ -146,10 +146,12 @@ def _sizes(leaf: np.ndarray) -> np.ndarray:
     Sorted, they have where none is more than ten times the one before. A zero has the geometric
     mean of all others, or 1.
     """
-    sizes = np.abs(leaf)
-    some = np.sort(sizes[sizes > 0])
+    sizes = np.abs(leaf).astype(float)
+    some = np.sort(sizes[sizes >= np.finfo(leaf.dtype).tiny])
     if not len(some):
         return np.ones_like(sizes)
     largest = np.append(np.flatnonzero(some[1:] > _ALIKE * some[:-1]), len(some) - 1)
-    group = np.searchsorted(some[largest], sizes)
-    return np.where(sizes > 0, some[largest[group]], np.exp(np.mean(np.log(some))))
+    # no number has no group, and nobody takes it for a sigma
+    group = np.minimum(np.searchsorted(some[largest], sizes), len(largest) - 1)
+    usual = np.where(sizes < some[0], np.exp(np.mean(np.log(some))), some[largest[group]])
+    return np.where(np.isnan(sizes), sizes, usual)

@@ -97,11 +97,49 @@ def test_a_function_that_always_fails_is_an_error(call):
 
 
 @pytest.mark.parametrize("y0", [(0.1, 5.0, 30.0), (2.0, 5.0, 30.0)])
-def test_samples_come_nearer_where_most_of_them_fail(y0):
+def test_a_barrier_is_no_end(y0):
     barrier = lambda y, args: jnp.sum(y - jnp.log(y))
     result = sd.minimise(barrier, jnp.array(y0), key=jax.random.key(0))
     assert result.reason == "converged"
     np.testing.assert_allclose(result.y, 1, atol=5e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("place", [0.02, 0.1])
+def test_samples_that_fail_come_nearer_to_the_best_point(place, seed):
+    """Stairs, which the wide model alone can go down, in a corner of walls."""
+    stairs = lambda y: jnp.sum(jnp.floor(200 * jnp.abs(y - place)) / 20)
+    fun = lambda y, args: jnp.where(jnp.all(y > 0), stairs(y), jnp.nan)
+    result = sd.minimise(fun, jnp.ones(4), key=jax.random.key(seed), max_evaluations=600)
+    assert result.fun == 0
+
+
+def test_failures_that_go_on_are_an_error():
+    """Numbers that came first do not keep a run going that has none any more."""
+    seen = []
+
+    def fails_later(y):
+        seen.append(y)
+        return np.float32(np.nan if len(seen) > 20 else np.sum((y - 3) ** 2))
+
+    box = sd.black_box(fails_later, jax.ShapeDtypeStruct((), np.float32), on_nonfinite="nan")
+    with pytest.raises(sd.MinimiseError, match="Too few samples were finite"):
+        sd.minimise(lambda y, args: box(y), jnp.ones(3), key=jax.random.key(0))
+
+
+@calls
+@pytest.mark.parametrize("size", [8.7e-8, 1e-6])
+def test_a_zero_but_for_rounding_is_no_scale(call, size):
+    line = lambda y: y[0] * jnp.exp(-TIMES) + y[1] * TIMES - 3 * jnp.exp(-TIMES) - 2 * TIMES
+    result = solved(call, line, jnp.array([1.0, size]))
+    np.testing.assert_allclose(result.y, [3, 2], atol=5e-3)
+
+
+def test_a_start_that_is_no_number_is_named():
+    with pytest.raises(ValueError, match="nan"):
+        solved(sd.minimise, lambda y: y, jnp.array([1.0, jnp.nan]))
+    np.testing.assert_allclose(sigma_of(1.0, 1e-40), 0.2, rtol=1e-6)
 
 
 @pytest.mark.parametrize("bounds", [None, (-10.0, 10.0)])

@@ -2,7 +2,8 @@
 
 Sigma may suit one parameter and be far too large for another. Where the point along a parameter is
 far higher than the start, it says nothing of the slope there, so a nearer one takes its place, and
-the parameter has so much smaller steps from then on.
+the parameter has so much smaller steps from then on. Sigma may also be nothing for a parameter that
+begins at zero but for rounding: a farther point follows.
 """
 
 import equinox as eqx
@@ -15,6 +16,8 @@ _HIGH = 10.0
 # so often a parameter is tried; at a value that is not finite it comes so much nearer, else at most
 # so much
 _TRIES, _NEARER, _NEAREST = 4, 0.1, 1e-6
+# where the residuals hardly change, a parameter is tried so many times as far away
+_FARTHER = 100.0
 
 
 class FirstPoints(eqx.Module):
@@ -38,6 +41,11 @@ class FirstPoints(eqx.Module):
         """All parameters again, at steps so many times as long, from a point with this loss."""
         left = jnp.full_like(self.left, _TRIES).at[0].set(0)
         return FirstPoints(width * self.reach, left, fun)
+
+    def farther(self, flat: Bool[Array, " n"]) -> "FirstPoints":
+        """These parameters again, farther away."""
+        left = jnp.append(jnp.zeros(1, self.left.dtype), flat.astype(self.left.dtype))
+        return FirstPoints(jnp.where(flat, _FARTHER, 1) * self.reach, left, self.before)
 
     def done(self) -> Bool[Array, ""]:
         """Whether no point is left."""

@@ -62,6 +62,12 @@ class History(eqx.Module):
 
         return jax.tree.map(latest, self, History(points, rows, funs, valid))
 
+    def alone(self, start: Float[Array, " n"]) -> tuple[Bool[Array, "M n"], Int[Array, ""]]:
+        """Which evaluations are off the start in this parameter alone; the place of the start's."""
+        moved = self.points != start[None]
+        one = self.valid & (jnp.sum(moved, axis=1) == 1)
+        return one[:, None] & moved, jnp.argmax(self.valid & ~jnp.any(moved, axis=1))
+
     def newest(self, count: int) -> tuple[Array, Array, Bool[Array, " count"]]:
         """The last points, their rows, and which of them are valid."""
         return self.points[-count:], self.rows[-count:], self.valid[-count:]

@@ -1,4 +1,4 @@
-"""The pilot of a search: pairs of points, wider and wider, where the function is the same so far.
+"""The pilot of a search: pairs of points, wider and wider, until the function changes.
 
 Around the start of a plateau no model says anything, and rounds of samples find its end late.
 Directions are random, both ways along each, four times as far every time, from the width of the

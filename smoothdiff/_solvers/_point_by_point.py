@@ -149,13 +149,14 @@ class PointStep(eqx.Module):
             tolerance = jnp.maximum(solver.atol + solver.rtol * scale, least_move)
             tiny = jnp.finfo(theta.dtype).tiny
             # of steps at several radii the first is that of the model
-            moved = after.telling(points[0] - params.theta, lower)
-            moved = moved / jnp.maximum(tolerance, tiny)
-            small = solver.norm(params.layout.tree(moved)) < 1
+            moved = (points[0] - params.theta) / jnp.maximum(tolerance, tiny)
+            ignored = after.ignored()
+            small = solver.norm(params.layout.tree(jnp.where(ignored & ~lower, 0, moved))) < 1
             # a point that only teaches the model is as long as the radius
             small |= after.right() & ~lower
             small &= (solver.rtol > 0) | (solver.atol > 0)
-            small &= after.settled() & ~after.plateau(_PLATEAU * rounding)
+            apart = jnp.where(ignored, jnp.inf, _PLATEAU * rounding)
+            small &= after.settled() & ~after.plateau(apart)
             small &= after.average is None
         least = (jnp.minimum(fun, progress.lowest_fun) == 0) & solver.squares
         least &= after.average is None

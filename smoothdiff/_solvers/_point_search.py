@@ -29,7 +29,7 @@ _NOTHING = 32
 class AbstractPointSearch(eqx.Module):
     """Where a search stands: all that was evaluated, and what comes next.
 
-    Where the first points are all the same, the `pilot` follows, and the first points again, as far
+    Where the first points hardly differ, the `pilot` follows, and the first points again, as far
     away as it found something else. Within bounds there is a `look` before the end.
 
     `evaluated` counts the evaluations, `small` the small steps in a row, `stale` the evaluations
@@ -128,9 +128,9 @@ class AbstractPointSearch(eqx.Module):
     def smoothing(self) -> Float[Array, ""]:
         """What smoothing adds to the function at the iterate, by the model."""
 
-    def telling(self, step: Float[Array, " n"], lower: Bool[Array, ""]) -> Float[Array, " n"]:
-        """What of a step says whether it is small."""
-        return step
+    def ignored(self) -> Bool[Array, " n"]:
+        """Parameters that seem to change nothing: steps along them say nothing."""
+        return jnp.zeros(self.start.shape, bool)
 
     def candidates(
         self, start: Float[Array, " n"], lowest: Float[Array, " n"]
@@ -186,15 +186,15 @@ class AbstractPointSearch(eqx.Module):
         return eqx.tree_at(lambda s: s.history, self, history)
 
     def enough(self, count: int) -> Bool[Array, ""]:
-        """Whether any of the last so many evaluations gave numbers, once there are so many.
+        """Whether any of the last evaluations gave numbers, once there are so many.
 
         Where there are numbers elsewhere, more may fail, as they come nearer.
         """
         valid = self.history.valid
-        known = jnp.any(valid)
-        first = (self.stage == FIRST) & known
-        lately = jnp.any(valid[-count:]) | (known & jnp.any(valid[-_COMING * count :]))
-        return (self.evaluated < count) | lately | first
+        first = (self.stage == FIRST) & jnp.any(valid)
+        # the best one stays among the oldest
+        newest = min(_COMING * count, len(valid) - 1)
+        return (self.evaluated < count) | jnp.any(valid[-newest:]) | first
 
     def converged(self) -> Bool[Array, ""]:
         """Whether the last steps were small."""
@@ -207,7 +207,7 @@ class AbstractPointSearch(eqx.Module):
         return jnp.any(self.history.valid & (self.history.funs == fun) & away)
 
     def piloting(self) -> Any:
-        """With the pilot next, if the first points are over and all evaluations are the same."""
+        """With the pilot next, if the first points are over and all evaluations hardly differ."""
         rows, valid = self.history.rows, self.history.valid
         same = jnp.all(hardly_differ(rows, rows[jnp.argmax(valid)]) | ~valid)
         stage = jnp.full_like(self.stage, PILOT)

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
 from smoothdiff._solvers._first_points import FirstPoints
-from smoothdiff._solvers._history import History, alike
+from smoothdiff._solvers._history import History, alike, hardly_differ
 from smoothdiff._solvers._pilot import Pilot
 from smoothdiff._solvers._point_search import AbstractPointSearch
 from smoothdiff._solvers._residual_trust import Proposal, TrustRegion
@@ -31,6 +31,8 @@ _IDLE, _NARROWER = 6, 0.1
 _VAIN = 0.5
 # so much of the loss at the start is much, where a search should end
 _MUCH = 0.1
+# a sigma is nothing below this share of the largest
+_BESIDE = 1e-3
 # so many steps in a row that halve the loss, within the width, are trusted again
 _TRUE = 2
 
@@ -214,7 +216,9 @@ class ResidualSearch(AbstractPointSearch):
         here = self.history.best(self.start)
         with_rows = self.kept(new)
         branches = [
-            lambda: with_rows._after_first(jnp.where(new.valid, new.funs, jnp.inf)).piloting(),
+            lambda: with_rows._after_first(
+                params, jnp.where(new.valid, new.funs, jnp.inf)
+            ).piloting(),
             lambda: with_rows._after_local(here[1], new.rows, new.valid, proposal),
             lambda: with_rows._after_wide(params, new.rows, new.valid, sizes),
             lambda: with_rows.piloted(params, new),
@@ -233,14 +237,24 @@ class ResidualSearch(AbstractPointSearch):
         stage = jnp.full_like(self.stage, WIDE)
         return eqx.tree_at(lambda s: (s.stage, s.wide), self, (stage, wide))
 
-    def _after_first(self, funs: Float[Array, " K"]) -> "ResidualSearch":
+    def _after_first(self, params: Params, funs: Float[Array, " K"]) -> "ResidualSearch":
         first = self.first.after(funs)
+        nearby = self._nearby(params)
+        first = where(first.done() & jnp.any(nearby), first.farther(nearby), first)
         stage = jnp.where(first.done(), TRUST, FIRST).astype(self.stage.dtype)
         known = eqx.tree_at(lambda s: (s.stage, s.first), self, (stage, first))
         _, row, _ = self.history.best(self.start)
         moved = ~alike(self.history.rows, row) & self.history.valid
         few = 2 * (1 + jnp.sum(moved)) <= jnp.sum(self.history.valid)
         return where(first.done() & few, known._to_wide(jnp.ones_like(self.wide.scale)), known)
+
+    def _nearby(self, params: Params) -> Bool[Array, " n"]:
+        """Which parameters hardly change the residuals, by steps that are nothing beside others."""
+        history = self.history
+        alone, here = history.alone(self.start)
+        level = hardly_differ(history.rows, history.rows[here])[:, None]
+        flat = jnp.any(alone & level, axis=0) & ~jnp.any(alone & ~level, axis=0)
+        return flat & (params.sigma < _BESIDE * jnp.max(params.sigma))
 
     def _after_local(
         self, row: Array, rows: Array, good: Array, proposal: Proposal

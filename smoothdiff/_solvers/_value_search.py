@@ -154,11 +154,12 @@ class ValueSearch(ValueState):
         stall = jnp.where(
             self.at_bottom(sizes, self.center.trust.width), _ENOUGH, center.trust.stall
         )
-        # where most samples gave no numbers they were too far away
-        some = jnp.sum(self.last(sizes)[1])
-        nearer = self.center.trust.width * jnp.where(some > 0, 0.5, NEARER)
-        width = jnp.where(2 * some < sizes.first, nearer, center.trust.width)
-        center = eqx.tree_at(lambda c: (c.trust.stall, c.trust.width), center, (stall, width))
+        center = eqx.tree_at(lambda c: c.trust.stall, center, stall)
+        # where no sample gave a number, the next ones are nearer to the best point
+        nearer = NEARER * self.center.trust.width
+        back = self.center.moved(history.best(self.start)[0], jnp.zeros_like(nearer))
+        back = eqx.tree_at(lambda c: c.trust.width, back, nearer)
+        center = where(jnp.any(self.last(sizes)[1]), center, back)
         new = center, jnp.zeros_like(self.taken), self.rounds + 1
         after = eqx.tree_at(lambda s: (s.center, s.taken, s.rounds), self, new)
         return after if average is None else after.with_mean(average.after(center.theta))

@@ -38,10 +38,12 @@ class ValueState(AbstractPointSearch):
     is low. Nor does any search where the function is `noisy`: where it gave another value for the
     same point, which the first round of samples begins with. `idle` counts the evaluations that
     lowered its lowest value by no more than rounding. Parameters are `unchanging` whose first
-    points had the value of the start.
+    points had the value of the start. First points are `reach` sigmas away where those farther away
+    failed.
     """
 
     steps: Float[Array, " n"]
+    reach: Float[Array, " n"]
     scan: Scan | None
     searches: Int[Array, ""]
     idle: Int[Array, ""]
@@ -79,6 +81,7 @@ class ValueState(AbstractPointSearch):
             average=None,
             look=None,
             steps=width * sigma,
+            reach=jnp.ones_like(theta),
             scan=None,
             searches=none,
             idle=none,
@@ -129,11 +132,8 @@ class ValueState(AbstractPointSearch):
     def compared(self) -> "ValueState":
         """With what the first points say of each parameter alone."""
         history = self.history
-        moved = history.points != self.start[None]
-        here = history.valid & ~jnp.any(moved, axis=1)
-        fun = jnp.max(jnp.where(here, history.funs, -jnp.inf))
-        alone = (history.valid & (jnp.sum(moved, axis=1) == 1))[:, None] & moved
-        changes = jnp.any(alone & (history.funs != fun)[:, None], axis=0)
+        alone, here = history.alone(self.start)
+        changes = jnp.any(alone & (history.funs != history.funs[here])[:, None], axis=0)
         return eqx.tree_at(lambda s: s.unchanging, self, jnp.any(alone, axis=0) & ~changes)
 
     def narrowed(self, params: Params, over: "ValueState", sizes: Sizes) -> "ValueState":
@@ -148,10 +148,13 @@ class ValueState(AbstractPointSearch):
         failed = jnp.any(moved & ~valid & recent[:, None], axis=0) & ~told
         steps = jnp.where(failed, NEARER * self.steps, self.steps)
         again = jnp.any(valid) & jnp.any(failed & (steps > _NEAREST * params.sigma))
-        anew = self.anew(params, self.start, steps, jnp.ones_like(steps[0]))
-        # the start is known
-        one = jnp.full_like(self.evaluated, 1 - sizes.step)
-        return where(again, eqx.tree_at(lambda s: s.evaluated, anew, one), over)
+        # from a point with a value
+        best, *_ = history.best(self.start)
+        known = jnp.any(history.valid & ~jnp.any(moved, axis=1))
+        anew = self.anew(params, jnp.where(known, self.start, best), steps, jnp.ones_like(steps[0]))
+        # which is not evaluated again
+        changed = jnp.full_like(self.evaluated, 1 - sizes.step), steps / params.sigma
+        return where(again, eqx.tree_at(lambda s: (s.evaluated, s.reach), anew, changed), over)
 
     def elsewhere(self, params: Params, theta: Float[Array, " n"]) -> "ValueState":
         """The same search from there."""
@@ -196,13 +199,16 @@ class ValueState(AbstractPointSearch):
         scanned = jnp.asarray(False) if self.scan is None else self.scan.done()
         return ((self.searches if self.average is None else self.rounds) > 0) & ~scanned
 
-    def width(self) -> Float[Array, ""]:
+    def width(self) -> Float[Array, " n"]:
         """The radius, or the width of the samples."""
+        return self.reach * self._length()
+
+    def _length(self) -> Float[Array, ""]:
         return jnp.where(self.stage == WIDE, self.center.trust.width, self.trust.radius)
 
-    def telling(self, step: Float[Array, " n"], lower: Bool[Array, ""]) -> Float[Array, " n"]:
-        """Without parameters that change nothing, unless it led to a lower point."""
-        return jnp.where(self.unchanging & ~lower, 0, step)
+    def ignored(self) -> Bool[Array, " n"]:
+        """By the first points; where the function has noise they may be the same by chance."""
+        return self.unchanging & ~self.noisy
 
     def candidates(
         self, start: Float[Array, " n"], lowest: Float[Array, " n"]
@@ -213,8 +219,9 @@ class ValueState(AbstractPointSearch):
         """
         if self.average is not None:
             return super().candidates(start, lowest)
-        back = jnp.where(self.unchanging, start, lowest)
-        return [jnp.where(jnp.any(self.unchanging), back, self.center.theta)]
+        ignored = self.ignored()
+        back = jnp.where(ignored, start, lowest)
+        return [jnp.where(jnp.any(ignored), back, self.center.theta)]
 
     def round(self) -> Int[Array, ""]:
         """So many rounds of samples."""
@@ -222,7 +229,7 @@ class ValueState(AbstractPointSearch):
 
     def smoothing(self) -> Float[Array, ""]:
         """Half the trace of the model's Hessian."""
-        return jnp.trace(self.trust.hessian) * self.width() ** 2 / 2
+        return jnp.trace(self.trust.hessian) * self._length() ** 2 / 2
 
     def checks_noise(self) -> Bool[Array, ""]:
         """Whether a point is evaluated again that was evaluated before."""

@@ -41,8 +41,10 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
 
     - **The first points** are the start, and one sigma from it along each parameter. Where the loss
       is more than ten times as high there, a nearer point follows, and the width of that parameter
-      shrinks as much. If all residuals are the same, pairs of points follow, each four times as far
-      away, up to a thousand sigma. Where these find a change, the first points are taken again.
+      shrinks as much. Where the residuals hardly change, and sigma is below a thousandth of the
+      largest, as for a parameter that is zero but for rounding, a farther one follows. If all
+      residuals hardly differ, pairs of points follow, each four times as far away, up to a thousand
+      sigma. Where these find a change, the first points are taken again.
     - **The local model** needs one evaluation a step. $y_t$ is the best point. J fits the nearest
       points, and of all that do it differs least from the last J. The radius $\Delta$ grows if the
       reduction is as predicted, and shrinks if the loss does not fall.
@@ -99,7 +101,8 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             Where no step as long as a hundredth of sigma was predicted, and more than a tenth of
             the first loss is left, that may be a ripple's minimum: wide rounds look around first.
         atol: absolute tolerance. With both zero no run converges; else the tolerance is at least
-            the root of the rounding of max(|y|, sigma).
+            the root of the rounding of max(|y|, sigma). With batches steps and tolerances are
+            compared by their norms, without sigma.
         norm: the norm of steps, in units of the tolerance.
         patience: how many evaluations in a row without a lower point end a search. By default
             20 (n + 1), and in the last search at least 100. With batches it counts steps, by

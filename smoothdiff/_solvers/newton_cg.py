@@ -35,10 +35,12 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     $$ \min_p \; g \cdot p + \tfrac12 p \cdot H p, \qquad \|p\|_{M^{-1}} \le \Delta $$
 
     With fewer than 100 parameters the function is evaluated point by point. The first points are
-    the start, and one sigma from it to both sides along each parameter. Where all are the same,
+    the start, and one sigma from it to both sides along each parameter. Where they hardly differ,
     pairs of points follow, each four times as far away, up to a thousand sigma, and then the first
-    points again, as far as these found a change. Then two models take turns, and the one that
-    lowers the function faster goes on:
+    points again, as far as these found a change. With `nonfinite="drop"` points that fail come
+    nearer: both of a parameter, or all of a round. A parameter whose first points had the value of
+    the start is no reason to go on, and is back there in the end if that raises nothing. Then two
+    models take turns, and the one that lowers the function faster goes on:
 
     - a local one, around the best point. It interpolates the nearest evaluations, and its Hessian
       differs least from the last one. The step that minimises it within the trust region is one
@@ -89,7 +91,8 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
             takes. If other searches are to follow, a search goes on until its patience ends: its
             wide samples may find more.
         atol: absolute tolerance. With both zero no run converges; else the tolerance is at least
-            the root of the rounding of max(|y|, sigma).
+            the root of the rounding of max(|y|, sigma). With batches steps and tolerances are
+            compared by their norms, without sigma.
         norm: the norm of steps, in units of the tolerance.
         patience: a search ends after so many evaluations in a row in which the wide model led
             nowhere, if the local one does not either; by default 20 (n + 1). Within a thousandth of
