@@ -134,7 +134,9 @@ class ValueState(AbstractPointSearch):
         history = self.history
         alone, here = history.alone(self.start)
         changes = jnp.any(alone & (history.funs != history.funs[here])[:, None], axis=0)
-        return eqx.tree_at(lambda s: s.unchanging, self, jnp.any(alone, axis=0) & ~changes)
+        # on a plateau nothing is known of any
+        unchanging = jnp.any(alone, axis=0) & ~changes & jnp.any(changes)
+        return eqx.tree_at(lambda s: s.unchanging, self, unchanging)
 
     def narrowed(self, params: Params, over: "ValueState", sizes: Sizes) -> "ValueState":
         """What is `over` if the first points tell of each parameter; else those again.
