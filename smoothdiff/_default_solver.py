@@ -147,7 +147,7 @@ def _sizes(leaf: np.ndarray) -> np.ndarray:
     mean of all others, or 1.
     """
     sizes = np.abs(leaf).astype(float)
-    some = np.sort(sizes[sizes >= np.finfo(leaf.dtype).tiny])
+    some = np.sort(sizes[sizes >= float(jnp.finfo(leaf.dtype).tiny)])
     if not len(some):
         return np.ones_like(sizes)
     largest = np.append(np.flatnonzero(some[1:] > _ALIKE * some[:-1]), len(some) - 1)

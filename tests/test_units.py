@@ -22,10 +22,13 @@ def decay(y):
 
 
 def solved(call, residuals, y0, **options):
-    """The result of a call, of residuals or of half the sum of their squares."""
-    value = lambda y, args: jnp.sum(residuals(y) ** 2) / 2
-    fun = value if call is sd.minimise else lambda y, args: residuals(y)
-    return call(fun, y0, key=jax.random.key(0), **options)
+    """The result of a call, of thirty residuals or of half the sum of their squares.
+
+    Always so many, and mostly three parameters: then there is little to compile.
+    """
+    rows = lambda y, args: jnp.resize(residuals(y), 30)
+    value = lambda y, args: jnp.sum(rows(y, args) ** 2) / 2
+    return call(value if call is sd.minimise else rows, y0, key=jax.random.key(0), **options)
 
 
 def sigma_of(*numbers):
@@ -49,10 +52,9 @@ def test_a_parameter_with_a_range_has_a_share_of_that():
 
 
 @calls
-@pytest.mark.parametrize("third", [100.0, 1000.0])
-def test_one_array_may_hold_very_different_units(call, third):
+def test_one_array_may_hold_very_different_units(call):
     residuals = lambda y: decay(y) - decay(FOUND)
-    result = solved(call, residuals, jnp.array([1e-6, 1.0, third]))
+    result = solved(call, residuals, UNITS)
     np.testing.assert_allclose(result.y / FOUND, 1, atol=2e-3)
 
 
@@ -86,14 +88,14 @@ def test_a_valley_is_followed_from_there(size):
 def test_points_that_nobody_chose_may_fail(call):
     """One sigma from the start, and wherever a step is too long, there is no number."""
     wall = lambda y: jnp.where(jnp.all(jnp.abs(y - 1) < 0.1), 30 * (y - 1.05), jnp.nan)
-    result = solved(call, wall, jnp.ones(2))
+    result = solved(call, wall, jnp.ones(3))
     np.testing.assert_allclose(result.y, 1.05, atol=2e-3)
 
 
 @calls
 def test_a_function_that_always_fails_is_an_error(call):
     with pytest.raises(sd.MinimiseError, match="begin where fun is finite"):
-        solved(call, lambda y: jnp.full(3, jnp.nan) * y[0], jnp.ones(2))
+        solved(call, lambda y: jnp.full(3, jnp.nan) * y[0], jnp.ones(3))
 
 
 @pytest.mark.parametrize("y0", [(0.1, 5.0, 30.0), (2.0, 5.0, 30.0)])
@@ -105,7 +107,7 @@ def test_a_barrier_is_no_end(y0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("place", [0.02, 0.1])
 def test_samples_that_fail_come_nearer_to_the_best_point(place, seed):
     """Stairs, which the wide model alone can go down, in a corner of walls."""
@@ -131,9 +133,10 @@ def test_failures_that_go_on_are_an_error():
 @calls
 @pytest.mark.parametrize("size", [8.7e-8, 1e-6])
 def test_a_zero_but_for_rounding_is_no_scale(call, size):
-    line = lambda y: y[0] * jnp.exp(-TIMES) + y[1] * TIMES - 3 * jnp.exp(-TIMES) - 2 * TIMES
-    result = solved(call, line, jnp.array([1.0, size]))
-    np.testing.assert_allclose(result.y, [3, 2], atol=5e-3)
+    bases = jnp.stack([jnp.exp(-TIMES), TIMES, jnp.cos(9 * TIMES)], axis=1)
+    lines = lambda y: jnp.sum(bases * (y - jnp.array([3.0, 2.0, 1.0]))[None], axis=1)
+    result = solved(call, lines, jnp.array([1.0, size, 1.0]))
+    np.testing.assert_allclose(result.y, [3, 2, 1], atol=5e-3)
 
 
 def test_a_start_that_is_no_number_is_named():
@@ -142,10 +145,9 @@ def test_a_start_that_is_no_number_is_named():
     np.testing.assert_allclose(sigma_of(1.0, 1e-40), 0.2, rtol=1e-6)
 
 
-@pytest.mark.parametrize("bounds", [None, (-10.0, 10.0)])
-def test_parameters_that_change_nothing_stay_where_they_were(bounds):
+def test_parameters_that_change_nothing_stay_where_they_were():
     one_of_three = lambda y, args: (y[0] - 3) ** 2 + 1
-    result = sd.minimise(one_of_three, jnp.ones(3), key=jax.random.key(0), bounds=bounds)
+    result = sd.minimise(one_of_three, jnp.ones(3), key=jax.random.key(0))
     np.testing.assert_allclose(result.y[0], 3, atol=2e-3)
     np.testing.assert_array_equal(result.y[1:], 1)
 
