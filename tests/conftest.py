@@ -37,6 +37,7 @@ UNOPTIMISED = [
     "grid_filters",
     "leave_out",
     "mesh_filters",
+    "noisy",
     "samplers",
     "stderr",
     "support",
