@@ -26,7 +26,7 @@ def solved(call, residuals, y0, **options):
 
     Always so many, and mostly three parameters: then there is little to compile.
     """
-    rows = lambda y, args: jnp.resize(residuals(y), 30)
+    rows = lambda y, args: jnp.resize(residuals(y), (30,))
     value = lambda y, args: jnp.sum(rows(y, args) ** 2) / 2
     return call(value if call is sd.minimise else rows, y0, key=jax.random.key(0), **options)
 
