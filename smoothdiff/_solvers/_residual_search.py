@@ -239,8 +239,8 @@ class ResidualSearch(AbstractPointSearch):
 
     def _after_first(self, params: Params, funs: Float[Array, " K"]) -> "ResidualSearch":
         first = self.first.after(funs)
-        nearby = self._nearby(params)
-        first = where(first.done() & jnp.any(nearby), first.farther(nearby), first)
+        too_near = self._too_near(params)
+        first = where(first.done() & jnp.any(too_near), first.farther(too_near), first)
         stage = jnp.where(first.done(), TRUST, FIRST).astype(self.stage.dtype)
         known = eqx.tree_at(lambda s: (s.stage, s.first), self, (stage, first))
         _, row, _ = self.history.best(self.start)
@@ -248,7 +248,7 @@ class ResidualSearch(AbstractPointSearch):
         few = 2 * (1 + jnp.sum(moved)) <= jnp.sum(self.history.valid)
         return where(first.done() & few, known._to_wide(jnp.ones_like(self.wide.scale)), known)
 
-    def _nearby(self, params: Params) -> Bool[Array, " n"]:
+    def _too_near(self, params: Params) -> Bool[Array, " n"]:
         """Which parameters hardly change the residuals, by steps that are nothing beside others."""
         history = self.history
         alone, here = history.alone(self.start)

@@ -37,10 +37,8 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     With fewer than 100 parameters the function is evaluated point by point. The first points are
     the start, and one sigma from it to both sides along each parameter. Where they hardly differ,
     pairs of points follow, each four times as far away, up to a thousand sigma, and then the first
-    points again, as far as these found a change. With `nonfinite="drop"` points that fail come
-    nearer: both of a parameter, or all of a round. A parameter whose first points had the value of
-    the start is no reason to go on, and is back there in the end if that raises nothing. Then two
-    models take turns, and the one that lowers the function faster goes on:
+    points again, as far as these found a change. Then two models take turns, and the one that
+    lowers the function faster goes on:
 
     - a local one, around the best point. It interpolates the nearest evaluations, and its Hessian
       differs least from the last one. The step that minimises it within the trust region is one
@@ -55,6 +53,10 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
       the higher they are. The width shrinks to the length of the step as far as noise allows, and
       grows where a round of samples has one value alone, as on a plateau. After six rounds that
       lead nowhere the center goes back to the best point.
+
+    With `nonfinite="drop"`, where both first points of a parameter fail, nearer ones follow, and so
+    they do after a round of samples that all fail. A parameter whose first points had the value of
+    the start keeps no run going. In the end it is back at the start, if that raises nothing.
 
     M, the metric of both, takes the shape of the Hessian, directions included up to 64 parameters.
     So sigma says where to begin.
