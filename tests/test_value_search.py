@@ -28,7 +28,7 @@ def after_wide_samples(found, fun):
         row = jnp.full((1, 1), value)
         new = jnp.asarray(point)[None], row, row[0], jnp.ones(1, bool)
         history = history.after(*new, jnp.asarray(1))
-    first = ValueSearch.of(PARAMS, jnp.zeros(N), PARAMS.sigma, jnp.asarray(WIDTH), history)
+    first = ValueSearch.of(PARAMS, jnp.zeros(N), jnp.asarray(WIDTH), history)
     search = cast(ValueSearch, first)
     trust = dataclasses.replace(search.trust, radius=jnp.asarray(RADIUS))
     turn = dataclasses.replace(search.turn, before=jnp.asarray(1.0), spent=search.turn.length)

@@ -1,10 +1,13 @@
-"""The first points of a search for residuals: the start, and one along each parameter.
+"""The first points of a search: the start, and one or two along each parameter.
 
-Sigma may suit one parameter and be far too large for another. Where the point along a parameter is
-far higher than the start, it says nothing of the slope there, so a nearer one takes its place, and
-the parameter has so much smaller steps from then on. Sigma may also be nothing for a parameter that
-begins at zero but for rounding: a farther point follows.
+Sigma may suit one parameter and be far too large for another. Where the points along a parameter
+say nothing of the slope at the start, nearer ones take their place, and the parameter has so much
+smaller steps from then on. Sigma may also be nothing for a parameter that begins at zero but for
+rounding: a farther point follows.
 """
+
+import dataclasses
+from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,37 +18,36 @@ from jaxtyping import Array, Bool, Float, Int
 _HIGH = 10.0
 # so often a parameter is tried; at a value that is not finite it comes so much nearer, else at most
 # so much
-_TRIES, _NEARER, _NEAREST = 4, 0.1, 1e-6
-# where the residuals hardly change, a parameter is tried so many times as far away
-_FARTHER = 100.0
+_TRIES, NEARER, _NEAREST = 4, 0.1, 1e-6
 
 
 class FirstPoints(eqx.Module):
-    """What is still to be evaluated: `left` counts the tries of the start and of each parameter.
+    """What is still to be evaluated: `left` counts the tries of the start and of each point.
 
-    `reach` is the length of the step along each parameter, in units of its sigma, and `before` the
-    loss at the start.
+    There are as many points for each parameter, one after the other. `reach` is the length of the
+    step along each parameter, in units of its sigma, and `before` the loss at the start.
     """
 
     reach: Float[Array, " n"]
-    left: Int[Array, " n+1"]
+    left: Int[Array, " m+1"]
     before: Float[Array, ""]
 
     @staticmethod
-    def start(theta: Float[Array, " n"]) -> "FirstPoints":
-        """Nothing has been evaluated."""
-        left = jnp.full(len(theta) + 1, _TRIES, jnp.int32)
+    def start(theta: Float[Array, " n"], sides: int = 1) -> "FirstPoints":
+        """Nothing has been evaluated; there are so many points for each parameter."""
+        left = jnp.full(sides * len(theta) + 1, _TRIES, jnp.int32)
         return FirstPoints(jnp.ones_like(theta), left, jnp.asarray(jnp.inf, theta.dtype))
 
-    def widened(self, width: Float[Array, ""], fun: Float[Array, ""]) -> "FirstPoints":
-        """All parameters again, at steps so many times as long, from a point with this loss."""
+    def around(self, fun: Float[Array, ""]) -> "FirstPoints":
+        """All parameters again, from a point with this loss."""
         left = jnp.full_like(self.left, _TRIES).at[0].set(0)
-        return FirstPoints(width * self.reach, left, fun)
+        return FirstPoints(self.reach, left, fun)
 
-    def farther(self, flat: Bool[Array, " n"]) -> "FirstPoints":
-        """These parameters again, farther away."""
-        left = jnp.append(jnp.zeros(1, self.left.dtype), flat.astype(self.left.dtype))
-        return FirstPoints(jnp.where(flat, _FARTHER, 1) * self.reach, left, self.before)
+    def again(self, which: Bool[Array, " n"], factor: float) -> "FirstPoints":
+        """These parameters once more, so many times as far away."""
+        points = jnp.repeat(which, (len(self.left) - 1) // len(which))
+        left = jnp.append(jnp.zeros(1, self.left.dtype), points.astype(self.left.dtype))
+        return FirstPoints(jnp.where(which, factor, 1) * self.reach, left, self.before)
 
     def done(self) -> Bool[Array, ""]:
         """Whether no point is left."""
@@ -57,6 +59,28 @@ class FirstPoints(eqx.Module):
         slot = jnp.arange(count, dtype=jnp.int32)
         at = order[jnp.minimum(slot, len(order) - 1)].astype(jnp.int32)
         return at, slot < jnp.sum(self.left > 0, dtype=jnp.int32)
+
+    def points(
+        self, directions: Float[Array, "m n"], others: Callable[[], Float[Array, "k n"]], count: int
+    ) -> Float[Array, "K n"]:
+        """The next points in units of the reach, from the start along these directions.
+
+        If there are fewer, others take the places that are left.
+        """
+        at, taken = self.next(count)
+        points = jnp.concatenate([jnp.zeros_like(directions[:1]), directions])[at]
+        if count == 1:
+            return points
+        fill = others()
+        slot = jnp.arange(count, dtype=jnp.int32)
+        return jnp.where(taken[:, None], points, fill[slot % len(fill)])
+
+    def known(self, count: int) -> "FirstPoints":
+        """With the next so many points evaluated, whatever came of them."""
+        at, taken = self.next(count)
+        # an index beyond the end is dropped
+        left = self.left.at[jnp.where(taken, at, len(self.left))].set(0, mode="drop")
+        return dataclasses.replace(self, left=left)
 
     def after(self, funs: Float[Array, " K"]) -> "FirstPoints":
         r"""With these losses, infinite where there is none.
@@ -70,10 +94,9 @@ class FirstPoints(eqx.Module):
         high = ~(funs <= _HIGH * before) & jnp.isfinite(before) & (before > 0) & ~start
         finite = jnp.isfinite(funs)
         nearer = jnp.sqrt(before / jnp.where(finite & high, funs, 1))
-        nearer = jnp.where(finite, jnp.maximum(nearer, _NEAREST), _NEARER)
+        nearer = jnp.where(finite, jnp.maximum(nearer, _NEAREST), NEARER)
         tries = jnp.where(high, self.left[at] - 1, 0)
         nearer = jnp.where(high & (tries > 0), nearer, 1)
-        # an index beyond the end is dropped
         left = self.left.at[jnp.where(taken, at, len(self.left))].set(tries, mode="drop")
         along = jnp.where(taken & (at > 0), at - 1, len(self.reach))
         return FirstPoints(self.reach.at[along].multiply(nearer, mode="drop"), left, before)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from smoothdiff._params import Params
 from smoothdiff._solvers._averaging import Average
 from smoothdiff._solvers._box import closed
+from smoothdiff._solvers._first_points import FirstPoints
 from smoothdiff._solvers._history import History, hardly_differ
 from smoothdiff._solvers._look import Look
 from smoothdiff._solvers._pilot import PAIRS, Pilot
@@ -29,8 +30,9 @@ _NOTHING = 32
 class AbstractPointSearch(eqx.Module):
     """Where a search stands: all that was evaluated, and what comes next.
 
-    Where the first points hardly differ, the `pilot` follows, and the first points again, as far
-    away as it found something else. Within bounds there is a `look` before the end.
+    It begins with the `first` points. Where they hardly differ, the `pilot` follows, and the first
+    points again, as far away as it found something else. Within bounds there is a `look` before the
+    end.
 
     `evaluated` counts the evaluations, `small` the small steps in a row, `stale` the evaluations
     since the last lower point. There is an `average` if the function takes random numbers.
@@ -39,6 +41,7 @@ class AbstractPointSearch(eqx.Module):
     stage: Int[Array, ""]
     history: History
     start: Float[Array, " n"]
+    first: FirstPoints
     evaluated: Int[Array, ""]
     small: Int[Array, ""]
     stale: Int[Array, ""]
@@ -70,12 +73,13 @@ class AbstractPointSearch(eqx.Module):
     def elsewhere(self, params: Params, theta: Float[Array, " n"]) -> "AbstractPointSearch":
         """Another such search before its first points, from a point that is known."""
 
-    @abc.abstractmethod
-    def width(self) -> Float[Array, "..."]:
-        """How far from the iterate the function is looked at, relative to sigma.
+    def width(self) -> Float[Array, " n"]:
+        """How far from the iterate the function is looked at, relative to sigma."""
+        return self.first.reach * self.length()
 
-        One number, or one for each parameter.
-        """
+    @abc.abstractmethod
+    def length(self) -> Float[Array, "..."]:
+        """The same, relative to where the first points were."""
 
     @abc.abstractmethod
     def propose(
@@ -228,10 +232,7 @@ class AbstractPointSearch(eqx.Module):
         pilot = self.pilot.after(steps, changed, new.valid)
         stage = jnp.where(pilot.left(), self.stage, pilot.follows)
         more = eqx.tree_at(lambda s: (s.stage, s.pilot), self, (stage, pilot))
-        # of the first points the start is known
-        one = jnp.full_like(self.evaluated, 1 - len(steps))
         widened = more.widened(params, self.iterate(), pilot.length)
-        widened = eqx.tree_at(lambda s: s.evaluated, widened, one)
         return where(pilot.length > 0, widened, more)
 
     def looking(self, params: Params, sizes: Sizes, least: Bool[Array, ""]) -> Any:
@@ -260,10 +261,7 @@ class AbstractPointSearch(eqx.Module):
         look = self.look.more(count, len(point))
         stage = jnp.where(look.done, look.follows, self.stage)
         more = eqx.tree_at(lambda s: (s.stage, s.look), self, (stage, look))
-        # of its first points the start is known
-        known = jnp.full_like(self.evaluated, 1 - count), look.again()
-        anew = self.elsewhere(params, point)
-        anew = eqx.tree_at(lambda s: (s.evaluated, s.look), anew, known)
+        anew = dataclasses.replace(self.elsewhere(params, point), look=look.again())
         return where(look.done & is_lower(fun, look.before), anew, more)
 
     def seed(self) -> Int[Array, ""]:

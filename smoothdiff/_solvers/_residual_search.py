@@ -31,8 +31,8 @@ _IDLE, _NARROWER = 6, 0.1
 _VAIN = 0.5
 # so much of the loss at the start is much, where a search should end
 _MUCH = 0.1
-# a sigma is nothing below this share of the largest
-_BESIDE = 1e-3
+# a sigma is nothing below this share of the largest; its parameter is tried so many times farther
+_BESIDE, _FARTHER = 1e-3, 100.0
 # so many steps in a row that halve the loss, within the width, are trusted again
 _TRUE = 2
 
@@ -40,7 +40,6 @@ _TRUE = 2
 class ResidualSearch(AbstractPointSearch):
     """Where a search stands, with the local model and the wide one."""
 
-    first: FirstPoints
     trust: TrustRegion
     wide: Wide
 
@@ -88,7 +87,8 @@ class ResidualSearch(AbstractPointSearch):
         self, params: Params, theta: Float[Array, " n"], width: Float[Array, ""]
     ) -> "ResidualSearch":
         """With longer steps along the parameters, from a point that is known."""
-        first = self.first.widened(width, self.history.best(theta)[2])
+        first = self.first.around(self.history.best(theta)[2])
+        first = dataclasses.replace(first, reach=width * first.reach)
         stage = jnp.full_like(self.stage, FIRST)
         return eqx.tree_at(lambda s: (s.stage, s.start, s.first), self, (stage, theta, first))
 
@@ -128,13 +128,10 @@ class ResidualSearch(AbstractPointSearch):
 
     def smoothing(self) -> Float[Array, ""]:
         """Half the squares of what the linear model adds."""
-        return jnp.sum((self.trust.jacobian * self._radius()[:, None]) ** 2) / 2
+        return jnp.sum((self.trust.jacobian * self.length()[:, None]) ** 2) / 2
 
-    def width(self) -> Float[Array, " n"]:
-        """How far from the iterate the function is looked at, relative to sigma."""
-        return self.first.reach * self._radius()
-
-    def _radius(self) -> Float[Array, " n"]:
+    def length(self) -> Float[Array, " n"]:
+        """The radius, or the width of the samples."""
         return jnp.where(self.stage == WIDE, self.wide.scale, self.trust.radius)
 
     def _scaled(self, params: Params) -> Params:
@@ -169,13 +166,8 @@ class ResidualSearch(AbstractPointSearch):
             units = jnp.eye(n, dtype=dtype)
             if low is not None and high is not None:
                 units = jnp.where(((high >= 1) | (high >= -low))[:, None], units, -units)
-            table = jnp.concatenate([jnp.zeros((1, n), dtype), units])
-            at, taken = self.first.next(count)
-            points = table[at]
-            if count > 1:
-                others = draw(max(sizes.first - 1, 1))
-                points = jnp.where(taken[:, None], points, others[slot % len(others)])
-            return self.start[None] + sigma[None] * points, nothing
+            others = lambda: draw(max(sizes.first - 1, 1))
+            return self.start[None] + sigma[None] * self.first.points(units, others, count), nothing
 
         def local() -> tuple[Array, Proposal]:
             center, row, _ = self.history.best(self.start)
@@ -240,7 +232,7 @@ class ResidualSearch(AbstractPointSearch):
     def _after_first(self, params: Params, funs: Float[Array, " K"]) -> "ResidualSearch":
         first = self.first.after(funs)
         too_near = self._too_near(params)
-        first = where(first.done() & jnp.any(too_near), first.farther(too_near), first)
+        first = where(first.done() & jnp.any(too_near), first.again(too_near, _FARTHER), first)
         stage = jnp.where(first.done(), TRUST, FIRST).astype(self.stage.dtype)
         known = eqx.tree_at(lambda s: (s.stage, s.first), self, (stage, first))
         _, row, _ = self.history.best(self.start)

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 from smoothdiff._params import Params
 from smoothdiff._solvers._base import all_finite
 from smoothdiff._solvers._box import bounds_of
+from smoothdiff._solvers._first_points import NEARER, FirstPoints
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import differ
 from smoothdiff._solvers._parameter_scan import Scan
@@ -24,7 +25,7 @@ from smoothdiff._solvers._quadratic_trust import Proposal
 from smoothdiff._solvers._ratio_test import are_level, is_lower
 from smoothdiff._solvers._stages import FIRST, SCAN, TRUST, WIDE, Sizes, by_stage, where
 from smoothdiff._solvers._turns import Turn
-from smoothdiff._solvers._value_state import NEARER, ValueState
+from smoothdiff._solvers._value_state import SIDES, ValueState
 
 # a first search is long after so many evaluations for each parameter, and one
 _LONG = 60
@@ -57,12 +58,9 @@ class ValueSearch(ValueState):
 
         def first() -> tuple[Array, Proposal]:
             unit = jnp.eye(n, dtype=self.start.dtype)
-            sides = jnp.stack([unit, -unit], axis=1).reshape(2 * n, n)
-            table = jnp.concatenate([0 * unit[:1], sides])
-            if count > 1:
-                table = jnp.concatenate([table, draw(count)])
-            at = jnp.minimum(self.evaluated + slot, len(table) - 1)
-            return self.start[None] + self.steps[None] * table[at], nothing
+            sides = jnp.stack([unit, -unit], axis=1).reshape(SIDES * n, n)
+            points = self.first.points(sides, lambda: draw(count), count)
+            return self.start[None] + (self.width() * params.sigma)[None] * points, nothing
 
         def local() -> tuple[Array, Proposal]:
             center, _, fun = self.history.best(self.start)
@@ -100,12 +98,14 @@ class ValueSearch(ValueState):
         known = eqx.tree_at(lambda s: (s.turn, s.idle), known, (turn, idle))
 
         def first() -> "ValueSearch":
-            enough = self.evaluated + sizes.step > 2 * len(self.start)
+            first = self.first.known(sizes.step)
+            enough = first.done()
             stage = jnp.where(enough, TRUST, FIRST).astype(self.stage.dtype)
             turn = Turn.start(len(self.start), known.history.best(self.start)[2])
-            over = eqx.tree_at(lambda s: (s.stage, s.turn), known, (stage, turn))
+            more = dataclasses.replace(known, first=first)
+            over = eqx.tree_at(lambda s: (s.stage, s.turn), more, (stage, turn))
             over = where(enough, over.compared(), over).piloting()
-            return where(enough, known.narrowed(params, over, sizes), over)
+            return where(enough, more.narrowed(params, over, sizes), over)
 
         def local() -> "ValueSearch":
             trust = self.trust.revise(proposal, before, new.funs, new.valid)
@@ -128,17 +128,18 @@ class ValueSearch(ValueState):
             branches.append(lambda: apart.after_look(params, sizes.step))
         if (scan := self.scan) is not None:
             funs = jnp.where(new.valid, new.funs, jnp.inf)
-            branches.append(lambda: apart._scanned(params, scan.after(new.points, funs), sizes))
+            branches.append(lambda: apart._scanned(params, scan.after(new.points, funs)))
         return by_stage(self.stage, stage, branches)
 
-    def _scanned(self, params: Params, scan: Scan, sizes: Sizes) -> "ValueSearch":
+    def _scanned(self, params: Params, scan: Scan) -> "ValueSearch":
         """With this scan; the best places of all parameters together are where a search begins."""
         known = eqx.tree_at(lambda s: s.scan, self, scan)
         goes_on = scan.failed & (self.searches == 0)
         stage = jnp.where(goes_on, WIDE, self.stage).astype(self.stage.dtype)
         known = eqx.tree_at(lambda s: s.stage, known, stage)
-        anew = known.anew(params, scan.found, scan.nearest, jnp.ones_like(scan.fun))
-        anew = dataclasses.replace(anew, evaluated=jnp.full_like(self.evaluated, -sizes.step))
+        first = FirstPoints.start(scan.found, SIDES)
+        first = dataclasses.replace(first, reach=scan.nearest / params.sigma)
+        anew = known.anew(params, scan.found, first, jnp.ones_like(scan.fun))
         return where(scan.done(), anew, known)
 
     def _stepped(self, params: Params, sizes: Sizes) -> "ValueSearch":

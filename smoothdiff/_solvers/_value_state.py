@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
+from smoothdiff._solvers._first_points import NEARER, FirstPoints
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._parameter_scan import Scan
@@ -21,8 +22,10 @@ from smoothdiff._solvers._turns import Turn
 
 # of so many later searches one begins at the start
 _PATIENT = 4
-# points that fail come so much nearer, until they are so near, in sigma
-NEARER, _NEAREST = 0.1, 1e-5
+# first points on so many sides of each parameter
+SIDES = 2
+# first points that fail come nearer until they are so near, in sigma
+_NEAREST = 1e-5
 # the widths of later searches, in sigma, as powers of ten at random
 _NARROWEST, _WIDEST = -1.5, 0.3
 
@@ -38,12 +41,9 @@ class ValueState(AbstractPointSearch):
     is low. Nor does any search where the function is `noisy`: where it gave another value for the
     same point, which the first round of samples begins with. `idle` counts the evaluations that
     lowered its lowest value by no more than rounding. Parameters are `unchanging` whose first
-    points had the value of the start. First points are `reach` sigmas away where those farther away
-    failed.
+    points had the value of the start.
     """
 
-    steps: Float[Array, " n"]
-    reach: Float[Array, " n"]
     scan: Scan | None
     searches: Int[Array, ""]
     idle: Int[Array, ""]
@@ -61,12 +61,16 @@ class ValueState(AbstractPointSearch):
         cls,
         params: Params,
         theta: Float[Array, " n"],
-        sigma: Float[Array, " n"],
         width: Array,
         history: History,
+        first: FirstPoints | None = None,
     ) -> "ValueState":
-        """Nothing is known but what is in the history; the first samples are so wide."""
-        none, n = jnp.zeros((), jnp.int32), len(theta)
+        """Nothing is known but what is in the history; the first samples are so wide.
+
+        Unless other first points are given, they are the start and two for each parameter.
+        """
+        first = FirstPoints.start(theta, SIDES) if first is None else first
+        none, n, sigma = jnp.zeros((), jnp.int32), len(theta), first.reach * params.sigma
         center = Center.start(theta, Metric.of(sigma, True))
         center = eqx.tree_at(lambda c: c.trust.width, center, width)
         never = jnp.zeros_like(width)
@@ -80,8 +84,7 @@ class ValueState(AbstractPointSearch):
             pilot=Pilot.start(theta),
             average=None,
             look=None,
-            steps=width * sigma,
-            reach=jnp.ones_like(theta),
+            first=first,
             scan=None,
             searches=none,
             idle=none,
@@ -112,7 +115,7 @@ class ValueState(AbstractPointSearch):
         here = self.patient(searches)
         power = jax.random.uniform(key, (), theta.dtype, _NARROWEST, _WIDEST)
         theta, width = jnp.where(here, start, theta), jnp.where(here, 1, 10**power)
-        anew = self.of(params, theta, params.sigma, width, empty)
+        anew = self.of(params, theta, width, empty)
         stage = jnp.full_like(self.stage, WIDE)
         if self.scan is not None:
             scan, scans = self.scan.next(params, *lowest)
@@ -127,7 +130,8 @@ class ValueState(AbstractPointSearch):
         self, params: Params, theta: Float[Array, " n"], width: Float[Array, ""]
     ) -> "ValueState":
         """With all first points again."""
-        return self.anew(params, theta, params.sigma, width)
+        fun = self.history.best(theta)[2]
+        return self.anew(params, theta, FirstPoints.start(theta, SIDES).around(fun), width)
 
     def compared(self) -> "ValueState":
         """With what the first points say of each parameter alone."""
@@ -139,7 +143,7 @@ class ValueState(AbstractPointSearch):
         return eqx.tree_at(lambda s: s.unchanging, self, unchanging)
 
     def narrowed(self, params: Params, over: "ValueState", sizes: Sizes) -> "ValueState":
-        """What is `over` if the first points tell of each parameter; else those again.
+        """What is `over` if the first points tell of each parameter; else those that do not again.
 
         Where both of a parameter fail, they come nearer.
         """
@@ -148,25 +152,25 @@ class ValueState(AbstractPointSearch):
         moved, valid = history.points != self.start[None], history.valid[:, None]
         told = jnp.any(moved & valid, axis=0)
         failed = jnp.any(moved & ~valid & recent[:, None], axis=0) & ~told
-        steps = jnp.where(failed, NEARER * self.steps, self.steps)
-        again = jnp.any(valid) & jnp.any(failed & (steps > _NEAREST * params.sigma))
-        # from a point with a value
-        best, *_ = history.best(self.start)
+        failed &= self.first.reach > _NEAREST
+        nearer = self.first.again(failed, NEARER)
+        # where the start has no value, from a point that has one
+        best, _, fun = history.best(self.start)
         known = jnp.any(history.valid & ~jnp.any(moved, axis=1))
-        anew = self.anew(params, jnp.where(known, self.start, best), steps, jnp.ones_like(steps[0]))
-        # which is not evaluated again
-        changed = jnp.full_like(self.evaluated, 1 - sizes.step), steps / params.sigma
-        return where(again, eqx.tree_at(lambda s: (s.evaluated, s.reach), anew, changed), over)
+        first = where(known, nearer, nearer.around(fun))
+        anew = self.anew(params, jnp.where(known, self.start, best), first, jnp.ones_like(fun))
+        anew = dataclasses.replace(anew, evaluated=self.evaluated)
+        return where(jnp.any(history.valid) & jnp.any(failed), anew, over)
 
     def elsewhere(self, params: Params, theta: Float[Array, " n"]) -> "ValueState":
         """The same search from there."""
-        anew = self.anew(params, theta, params.sigma, jnp.ones_like(theta[0]))
+        anew = self.widened(params, theta, jnp.ones_like(theta[0]))
         return dataclasses.replace(anew, rounds=jnp.zeros_like(self.rounds))
 
-    def anew(self, params: Params, theta: Array, sigma: Array, width: Array) -> "ValueState":
+    def anew(self, params: Params, theta: Array, first: FirstPoints, width: Array) -> "ValueState":
         """The same search from another point, with all that was evaluated."""
         names = "pilot", "average", "look", "searches", "rounds", "noisy", "scan", "unchanging"
-        anew = self.of(params, theta, sigma, width, self.history)
+        anew = self.of(params, theta, width, self.history, first)
         return dataclasses.replace(anew, **{name: getattr(self, name) for name in names})
 
     def settled(self) -> Bool[Array, ""]:
@@ -201,11 +205,8 @@ class ValueState(AbstractPointSearch):
         scanned = jnp.asarray(False) if self.scan is None else self.scan.done()
         return ((self.searches if self.average is None else self.rounds) > 0) & ~scanned
 
-    def width(self) -> Float[Array, " n"]:
+    def length(self) -> Float[Array, ""]:
         """The radius, or the width of the samples."""
-        return self.reach * self._length()
-
-    def _length(self) -> Float[Array, ""]:
         return jnp.where(self.stage == WIDE, self.center.trust.width, self.trust.radius)
 
     def ignored(self) -> Bool[Array, " n"]:
@@ -231,7 +232,7 @@ class ValueState(AbstractPointSearch):
 
     def smoothing(self) -> Float[Array, ""]:
         """Half the trace of the model's Hessian."""
-        return jnp.trace(self.trust.hessian) * self._length() ** 2 / 2
+        return jnp.trace(self.trust.hessian) * self.length() ** 2 / 2
 
     def checks_noise(self) -> Bool[Array, ""]:
         """Whether a point is evaluated again that was evaluated before."""

@@ -186,7 +186,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         length = max(self.history or usual, sizes.first, n + 2)
         history = History.empty(length, n, 1, theta.dtype)
         width = jnp.ones((), theta.dtype)
-        search = ValueSearch.of(params, theta, params.sigma, width, history)
+        search = ValueSearch.of(params, theta, width, history)
         if self.restarts and bounded(params):
             scan = Scan.start(theta, jnp.zeros_like(width), params.sigma)
             search = dataclasses.replace(search, scan=scan)
