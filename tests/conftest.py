@@ -107,9 +107,9 @@ def x64():
         yield
 
 
-@pytest.fixture(params=["float32", "float64"])
+@pytest.fixture(params=["float32", pytest.param("float64", marks=pytest.mark.slow)])
 def dtype(request):
-    """Runs a test in both precisions; float64 is switched on only for its own run."""
+    """Runs a test in both precisions; float64 is slow and switched on only for its own run."""
     with jax.enable_x64(request.param == "float64"):
         yield jax.numpy.dtype(request.param)
 

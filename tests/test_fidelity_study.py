@@ -48,6 +48,7 @@ def bars():
     return made, counts
 
 
+@pytest.mark.slow
 def test_seconds_are_those_of_the_pictures_until_then(bars):
     made, counts = bars
     made.times = {id(level): float(level.cost) for level in (*made.levels, made.chosen)}

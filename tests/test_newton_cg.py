@@ -237,16 +237,10 @@ def test_a_constant_function_ends_as_noise(dtype):
     assert 10 < result.history[-1].sigma < np.inf
 
 
-# the median of six runs with more noise than signal depends on the rounding of the machine
-@pytest.mark.parametrize(
-    ("problem", "noise", "seeds"),
-    [
-        (noisy, 0.1, 6),
-        pytest.param(noisy, 0.1, 20, marks=pytest.mark.slow),
-        pytest.param(noisier, 1.0, 20, marks=pytest.mark.slow),
-    ],
-)
-def test_noise_of_1_and_10_percent_of_the_range(problem, noise, seeds):
+# the median of a few runs with more noise than signal depends on the rounding of the machine
+@pytest.mark.slow
+@pytest.mark.parametrize(("problem", "noise"), [(noisy, 0.1), (noisier, 1.0)])
+def test_noise_of_1_and_10_percent_of_the_range(problem, noise):
     # from (2, 2) to the target the function falls by 8.5
     args = args_of(problem, (0.5, -0.5), np.float32)
     solver, y0 = sd.NewtonCG(jnp.float32(0.5)), jnp.array([2.0, 2.0])
@@ -262,7 +256,7 @@ def test_noise_of_1_and_10_percent_of_the_range(problem, noise, seeds):
         STREAM[0] = np.random.default_rng(seed)
         return distance(center(seed), (0.5, -0.5))
 
-    away = [away_of(seed) for seed in range(seeds)]
+    away = [away_of(seed) for seed in range(20)]
     # where the function has risen by a fifth of the noise, and by as much as the noise; a tenth
     # is met on some machines only, as rounding leads runs apart
     assert np.median(away) < np.sqrt(0.2 * noise)

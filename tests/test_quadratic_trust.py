@@ -3,6 +3,7 @@
 import dataclasses
 from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -38,11 +39,20 @@ def around(count, width=1.0):
     return width * np.array([*first, *more][:count])
 
 
-def proposal_of(history, radius=10.0, bounds=None, count=1):
+# compiled, as in a solver
+REVISE = eqx.filter_jit(QuadraticTrust.revise)
+
+
+@eqx.filter_jit
+def propose(trust, history, bounds=None, count=1):
     params = take_apart(jnp.zeros(N), jnp.ones(N), bounds)
-    trust = QuadraticTrust.start(params.sigma, jnp.asarray(radius))
     center, _, fun = history.best(jnp.zeros(N))
-    proposal = trust.propose(history, center, fun, params, count)
+    return trust.propose(history, center, fun, params, count), center, fun
+
+
+def proposal_of(history, radius=10.0, bounds=None, count=1):
+    trust = QuadraticTrust.start(jnp.ones(N), jnp.asarray(radius))
+    proposal, center, fun = propose(trust, history, bounds, count)
     return trust, proposal, np.asarray(center), float(fun)
 
 
@@ -86,7 +96,7 @@ def test_several_steps_at_once_have_several_radii(x64):
 def test_the_radius_follows_the_ratio_and_the_metric_the_hessian(x64):
     trust, proposal, _, fun = proposal_of(known(around(10, 0.05)), radius=0.05)
     good = jnp.ones(1, bool)
-    outcome = lambda value: trust.revise(proposal, jnp.asarray(fun), jnp.asarray([value]), good)
+    outcome = lambda value: REVISE(trust, proposal, jnp.asarray(fun), jnp.asarray([value]), good)
     kept = outcome(fun - float(proposal.reduction[0]))
     assert kept.radius > 0.06
     assert outcome(fun + 1).radius < 0.03
@@ -104,7 +114,7 @@ def test_it_is_stuck_after_five_failures_in_a_row_and_failed_without_a_radius(x6
     trust, proposal, _, fun = proposal_of(known(around(10)))
     for _ in range(5):
         assert not trust.stuck()
-        trust = trust.revise(proposal, jnp.asarray(fun), jnp.asarray([fun + 1]), jnp.ones(1, bool))
+        trust = REVISE(trust, proposal, jnp.asarray(fun), jnp.asarray([fun + 1]), jnp.ones(1, bool))
     assert trust.stuck()
     assert not trust.failed()
     assert not trust.retried().stuck()
@@ -120,7 +130,7 @@ def test_where_the_model_is_flat_the_step_is_for_the_geometry(x64):
 
 
 def of_check(trust, proposal, fun, rise):
-    return trust.revise(proposal, fun, jnp.asarray([fun + rise]), jnp.ones(1, bool))
+    return REVISE(trust, proposal, fun, jnp.asarray([fun + rise]), jnp.ones(1, bool))
 
 
 def test_a_check_is_where_the_model_knows_least(x64):
@@ -129,11 +139,9 @@ def test_a_check_is_where_the_model_knows_least(x64):
     plane = around(12, 0.3) @ (np.eye(N) - np.outer(normal, normal))
     history, high = known(plane), jnp.full(N, 0.2)
     for bounds in (None, (-9 * jnp.ones(N), high)):
-        params = take_apart(jnp.zeros(N), jnp.ones(N), bounds)
-        trust = QuadraticTrust.start(params.sigma, jnp.asarray(0.3))
+        trust = QuadraticTrust.start(jnp.ones(N), jnp.asarray(0.3))
         trust = dataclasses.replace(trust, check=jnp.asarray(True))
-        center, _, fun = history.best(jnp.zeros(N))
-        proposal = trust.propose(history, center, fun, params, 1)
+        proposal, center, fun = propose(trust, history, bounds)
         step = np.asarray(proposal.steps[0])
         assert proposal.reduction[0] == 0
         if bounds is None:
@@ -151,11 +159,10 @@ def test_a_check_is_where_the_model_knows_least(x64):
 
 def test_only_a_model_that_is_right_about_a_check_may_have_converged(x64):
     history = known([*around(10), BEST])
-    trust, _, center, fun = proposal_of(history, radius=0.3)
+    trust = QuadraticTrust.start(jnp.ones(N), jnp.asarray(0.3))
     trust = dataclasses.replace(trust, check=jnp.asarray(True))
-    params = take_apart(jnp.zeros(N), jnp.ones(N), None)
-    proposal = trust.propose(history, jnp.asarray(center), jnp.asarray(fun), params, 1)
-    after = partial(of_check, trust, proposal, jnp.asarray(fun))
+    proposal, _, fun = propose(trust, history)
+    after = partial(of_check, trust, proposal, fun)
     right = [bool(after(share * proposal.rise).settled) for share in (1, 0.7, 0.3, 3, -1)]
     assert right == [True, True, False, False, False]
 
@@ -164,7 +171,7 @@ def test_a_radius_that_is_too_small_for_a_promise_grows():
     history = known(around(10, 1e-3).astype(np.float32))
     trust, proposal, _, fun = proposal_of(history, radius=1e-7)
     assert proposal.tight
-    after = trust.revise(proposal, jnp.asarray(fun), jnp.asarray([fun]), jnp.ones(1, bool))
+    after = REVISE(trust, proposal, jnp.asarray(fun), jnp.asarray([fun]), jnp.ones(1, bool))
     assert after.radius == pytest.approx(2e-7)
     assert not after.settled
 

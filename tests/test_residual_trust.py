@@ -76,6 +76,8 @@ def test_a_step_is_finite_whatever_the_scale(factor):
     assert np.all(np.isfinite(flat))
 
 
+# compiled, as in a solver
+PROPOSE, REVISE = eqx.filter_jit(TrustRegion.propose), eqx.filter_jit(TrustRegion.revise)
 JACOBIAN = np.random.default_rng(3).normal(size=(3, 7))
 
 
@@ -90,7 +92,7 @@ def known(points):
 
 def propose(trust, history):
     center, row, _ = history.best(jnp.zeros(3))
-    proposal = trust.propose(history, center, row, jnp.ones(3), NONE, 1)
+    proposal = PROPOSE(trust, history, center, row, jnp.ones(3), NONE, 1)
     return proposal, center, row
 
 
@@ -126,7 +128,7 @@ def outcome(fun, trust=None, predicted=0.5, ahead=0.0):
     )
     trust = trust or TrustRegion.start(jnp.asarray(1.0), 1, 1)
     row = jnp.full((1, 1), fun)
-    return trust.revise(proposal, jnp.ones(1), row, jnp.isfinite(row[:, 0]))
+    return REVISE(trust, proposal, jnp.ones(1), row, jnp.isfinite(row[:, 0]))
 
 
 def test_the_radius_follows_the_acceptance_ratio():

@@ -57,8 +57,8 @@ SUPPORT = sd.local_support(1, ndim=1)
     [
         pytest.param(sd.Gaussian(), 16, "mean", marks=pytest.mark.slow),
         (sd.Gaussian(), 16, "none"),
-        (sd.Gaussian(antithetic=True), 17, "center"),
-        (sd.Sobol(replicates=2), 16, "mean"),
+        pytest.param(sd.Gaussian(antithetic=True), 17, "center", marks=pytest.mark.slow),
+        pytest.param(sd.Sobol(replicates=2), 16, "mean", marks=pytest.mark.slow),
         (sd.Orthogonal(), 24, "mean"),
     ],
     ids=["mean", "none", "center", "sobol", "frames"],
