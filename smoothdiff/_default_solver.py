@@ -30,6 +30,8 @@ _SHARE, _ALIKE = 0.2, 10.0
 _WIDE = 0.4
 # a step of Adam, in sigmas
 _RATE = 0.15
+# searches that may follow until a target is reached: more than any limit allows
+_UNTIL = 2**30
 # so many parameters on a term, in the mean, can be searched for by themselves
 _FEW = 10
 
@@ -49,12 +51,15 @@ def default_solver(
     residuals: bool,
     support: Callable[[PyTree], Array] | None = None,
     anywhere: bool = False,
+    until: bool = False,
 ) -> Any:
     """The rule that `minimise` and `least_squares` state.
 
-    `anywhere` says that no sigma is the user's, who does not ask to look around the start. What
-    fails is left out, as nobody chose where the points are.
+    `anywhere` says that no sigma is the user's, who does not ask to look around the start; `until`
+    that there is a target, so that one search follows another. What fails is left out, as nobody
+    chose where the points are.
     """
+    restarts = _UNTIL if until else 0
     usual = _usual(y, bounds, share_of_range(y, residuals, support))
     if sigma is None:
         sigma = usual
@@ -67,13 +72,13 @@ def default_solver(
             sigma = jax.tree.map(lambda s, d: d if s is None else s, full, usual, is_leaf=_is_none)
     if residuals:
         if support is None:
-            return GaussNewton(sigma, nonfinite="drop")
+            return GaussNewton(sigma, restarts=restarts, nonfinite="drop")
         if anywhere and _all_bounded(y, bounds) and _few_on_a_term(y, support):
             return LocalCrossEntropy(support, nonfinite="drop")
         return LocalGaussNewton(sigma, support, nonfinite="drop")
     # with more parameters a quadratic model takes too many evaluations
     if NewtonCG(1.0).sizes(y) is not None:
-        return NewtonCG(sigma, nonfinite="drop")
+        return NewtonCG(sigma, restarts=restarts, nonfinite="drop")
     optim = optax.chain(optax.scale_by_adam(), _in_sigmas(sigma))
     return FirstOrder(optim, sigma, adaptive=not callable(sigma), nonfinite="drop")
 

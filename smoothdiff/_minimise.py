@@ -88,7 +88,8 @@ def minimise(
             an optimistix minimiser that is given one of these, such as `BestSoFarMinimiser`.
         sigma: the smoothing width of the default solver, in the units of the parameters: how far
             from y0 to look at first. A number or a pytree like the parameters.
-        target: a value that is good enough: the run ends where one as low was seen.
+        target: a value that is good enough: the run ends where one as low was seen. Until then the
+            default solver has `restarts`: where a search ends, another begins elsewhere.
         max_evaluations: the most evaluations of `fun`, never exceeded. Some are set aside to judge
             the result under noise. Where the function is called between steps, one tells whether it
             has noise, and if not, steps take the others; else they may stay unused. If neither this
@@ -260,7 +261,8 @@ def _run(
         residuals = interface is optx.AbstractLeastSquaresSolver
         if space is not None and sigma is None:
             sigma = units.sigma(share_of_range(y, residuals, support))
-        solver = default_solver(y, bounds, sigma, residuals, support, anywhere)
+        until = limits[-1] is not None and not takes_key
+        solver = default_solver(y, bounds, sigma, residuals, support, anywhere, until)
     else:
         check_solver(solver, interface, example, sigma, support)
         solver = solver if isinstance(solver, AbstractSmoothSolver) else Wrapped(solver)
