@@ -75,6 +75,19 @@ class QuadraticTrust(eqx.Module):
         no = jnp.asarray(False)
         return QuadraticTrust(Metric.of(sigma, True), radius, hessian, no, no, none, none, no, no)
 
+    def nothing(self, count: int) -> Proposal:
+        """No steps, where so many other points are evaluated."""
+        zeros, no = lambda *shape: jnp.zeros(shape, self.radius.dtype), jnp.asarray(False)
+        return Proposal(
+            steps=zeros(count, len(self.hessian)),
+            reduction=zeros(count),
+            hessian=self.hessian,
+            poor=no,
+            check=no,
+            rise=zeros(),
+            tight=no,
+        )
+
     def failed(self) -> Bool[Array, ""]:
         """Whether the model is of no use here, or nothing is left to do for it."""
         slow = self.slow >= _SLOW * (len(self.hessian) + 1)

@@ -148,22 +148,13 @@ class ResidualSearch(AbstractPointSearch):
         """The first points, the end of a step, or the next samples of a round."""
         params = self._scaled(params)
         sigma = params.sigma
-        count, size = sizes.step, self.history.rows.shape[1]
-        n, dtype = len(sigma), sigma.dtype
+        count, n = sizes.step, len(sigma)
         slot = jnp.arange(count, dtype=jnp.int32)
-        nothing = Proposal(
-            steps=jnp.zeros((count, n), dtype),
-            predicted=jnp.zeros((count, size), dtype),
-            reduction=jnp.zeros(count, dtype),
-            slope=jnp.zeros(count, dtype),
-            ahead=jnp.zeros((), dtype),
-            jacobian=self.trust.jacobian,
-            poor=jnp.asarray(False),
-        )
+        nothing = self.trust.nothing(count)
 
         def first() -> tuple[Array, Proposal]:
             low, high = sides_of(params, self.start)
-            units = jnp.eye(n, dtype=dtype)
+            units = jnp.eye(n, dtype=sigma.dtype)
             if low is not None and high is not None:
                 units = jnp.where(((high >= 1) | (high >= -low))[:, None], units, -units)
             others = lambda: draw(max(sizes.first - 1, 1))

@@ -95,6 +95,20 @@ class TrustRegion(eqx.Module):
         no = jnp.asarray(False)
         return TrustRegion(radius, jacobian, no, none, none, zero, zero, no, none, no, zero)
 
+    def nothing(self, count: int) -> Proposal:
+        """No steps, where so many other points are evaluated."""
+        n, size = self.jacobian.shape
+        zeros = lambda *shape: jnp.zeros(shape, self.radius.dtype)
+        return Proposal(
+            steps=zeros(count, n),
+            predicted=zeros(count, size),
+            reduction=zeros(count),
+            slope=zeros(count),
+            ahead=zeros(),
+            jacobian=self.jacobian,
+            poor=jnp.asarray(False),
+        )
+
     def failed(self) -> Bool[Array, ""]:
         """Whether a local model is of no use."""
         return (

@@ -46,15 +46,7 @@ class ValueSearch(ValueState):
         """The first points, the end of a step, or the next samples of a round."""
         n, count = len(self.start), sizes.step
         slot = jnp.arange(count, dtype=jnp.int32)
-        nothing = Proposal(
-            steps=jnp.zeros((count, n), self.start.dtype),
-            reduction=jnp.zeros(count, self.start.dtype),
-            hessian=self.trust.hessian,
-            poor=jnp.asarray(False),
-            check=jnp.asarray(False),
-            rise=jnp.zeros((), self.start.dtype),
-            tight=jnp.asarray(False),
-        )
+        nothing = self.trust.nothing(count)
 
         def first() -> tuple[Array, Proposal]:
             unit = jnp.eye(n, dtype=self.start.dtype)
