@@ -12,18 +12,16 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.extend.core import ClosedJaxpr
-from jax.sharding import NamedSharding
 from jaxtyping import Array, Bool, Float, PyTree
 
-from smoothdiff._params import layout_of
+from smoothdiff._flat import Flat
+from smoothdiff._host_function import evaluator, rows_at, traced
 from smoothdiff._programs import QUICKLY, is_short
 from smoothdiff._run import Problem, Trial
 from smoothdiff._solvers._base import smoothed_params
 from smoothdiff._solvers._evaluator import Evaluator
 from smoothdiff._solvers._judgement import Values, differ
 from smoothdiff._solvers._point_by_point import PointState, PointStep
-from smoothdiff._solvers._point_search import AbstractPointSearch
 from smoothdiff._solvers._random_numbers import in_round, takes_key
 from smoothdiff._solvers._stages import Sizes
 
@@ -59,8 +57,10 @@ class HostProblem(Problem):
     def step(self, y: PyTree, state: PointState) -> tuple[PyTree, PointState, Bool[Array, ""]]:
         """The next evaluations, between what is compiled for the stage of the search."""
         points, proposal = self.host.propose(y, state)
-        args = self.host.parts(y, state).numbers(self.args)
-        rows = rows_at(self._evaluator(args, y), points, len(points), self.quick)
+        args = self.args
+        if takes_key(self.options):
+            args = self.host.parts(y, state).numbers(args)
+        rows = rows_at(_evaluator(self, args, y), points, len(points), self.quick)
         return self.host.told(y, state, points, rows, proposal)
 
     def done(self, y: PyTree, state: PointState) -> Bool[Array, ""]:
@@ -97,17 +97,12 @@ class HostProblem(Problem):
     def _values(self, y: PyTree) -> Values:
         def at(points: PyTree[Array], number: Array) -> Array:
             args = in_round(self.args, self.options, number)
-            evaluate = self._evaluator(args, y)
+            evaluate = _evaluator(self, args, y)
             vectors = jax.vmap(lambda y: evaluate.layout.vector(jax.tree.leaves(y)))(points)
             rows = rows_at(evaluate, vectors, self.host.sizes.step, self.quick)
             return evaluate.funs(rows)
 
         return Values(at, takes_key(self.options))
-
-    def _evaluator(self, args: PyTree, y: PyTree) -> Evaluator:
-        solver = self.solver
-        parts = (getattr(solver, name, None) for name in ("batch_size", "sharding"))
-        return evaluator(self.fun, solver.squares, args, y, *parts)
 
 
 class HostSteps(eqx.Module):
@@ -144,7 +139,7 @@ class HostSteps(eqx.Module):
     ) -> tuple[Float[Array, "K n"], Any]:
         """The points of the next step, or so many of them, and what the model says of them."""
         propose, *_ = _compiled(state)
-        return propose(self.parts(y, state, count), int(state.search.stage))
+        return propose(_flat(self, y, state), _sizes(self, count), int(state.search.stage))
 
     def told(
         self,
@@ -155,9 +150,15 @@ class HostSteps(eqx.Module):
         proposal: Any,
     ) -> tuple[PyTree, PointState, Bool[Array, ""]]:
         """The next iterate and state, and whether the solver wants to stop there."""
-        parts, stage = self.parts(y, state, len(points)), int(state.search.stage)
+        step, sizes, stage = (
+            _flat(self, y, state),
+            _sizes(self, len(points)),
+            int(state.search.stage),
+        )
         _, searched, counted = _compiled(state)
-        return counted(parts, points, rows, searched(parts, points, rows, proposal, stage))
+        after = searched(step, points, rows, proposal, sizes, stage)
+        new_y, state_after, over = counted(step, points, rows, after, sizes)
+        return new_y, state_after.tree(), over
 
     def learnt(
         self,
@@ -171,44 +172,24 @@ class HostSteps(eqx.Module):
 
     def parts(self, y: PyTree[Array], state: PointState, count: int | None = None) -> PointStep:
         """The step, of so many evaluations if that is given."""
-        sizes = self.sizes if count is None else self.sizes._replace(step=count)
-        return PointStep(self.solver, sizes, y, self.options, state)
+        return PointStep(self.solver, _sizes(self, count), y, self.options, state)
 
 
-class _Function(eqx.Module):
-    """The user's function as optimistix calls it."""
-
-    fun: Callable[[PyTree, PyTree], Any]
-
-    def __call__(self, y: PyTree, args: PyTree) -> tuple[PyTree[Array], None]:
-        return jax.tree.map(jnp.asarray, self.fun(y, args)), None
+# functions and not methods, each call of which makes a module
 
 
-def evaluator(
-    fun: Callable,
-    squares: bool,
-    args: PyTree,
-    y: PyTree[Array],
-    size: int | None = None,
-    sharding: NamedSharding | None = None,
-) -> Evaluator:
-    """The function, which returns residuals or not, for parameters like `y`."""
-    return Evaluator(_Function(fun), args, layout_of(y), squares, size, sharding)
+def _evaluator(problem: HostProblem, args: PyTree, y: PyTree) -> Evaluator:
+    solver = problem.solver
+    parts = (getattr(solver, name, None) for name in ("batch_size", "sharding"))
+    return evaluator(problem.fun, solver.squares, args, y, *parts)
 
 
-def traced(fun: Callable, y: PyTree[Array], args: PyTree) -> tuple[ClosedJaxpr, PyTree]:
-    """The function as a program at one point, and the structure of what it returns."""
-    fn = _Function(fun)
-    return jax.make_jaxpr(lambda y: fn(y, args)[0], return_shape=True)(y)
+def _sizes(steps: HostSteps, count: int | None) -> Sizes:
+    return steps.sizes if count is None else steps.sizes._replace(step=count)
 
 
-def rows_at(
-    evaluate: Evaluator, points: Float[Array, "m n"], at_once: int, quick: bool = False
-) -> Float[Array, "m P"]:
-    """What the function returns at points, so many at once: in a step, and by its program later."""
-    rows = _rows_quickly if quick else _rows
-    parts = [rows(evaluate, points[i : i + at_once]) for i in range(0, len(points), at_once)]
-    return parts[0] if len(parts) == 1 else jnp.concatenate(parts)
+def _flat(steps: HostSteps, y: PyTree[Array], state: PointState) -> tuple[Flat, PyTree, Flat]:
+    return Flat.of((steps.solver, steps.options)), y, Flat.of(state)
 
 
 @eqx.filter_jit
@@ -228,33 +209,41 @@ def _learnt(step: PointStep, points: Array, rows: Array) -> PointState:
     return step.learnt(points, rows)
 
 
-def _propose(step: PointStep, stage: int) -> tuple[Array, Any]:
-    return step.propose(stage)
+def _step_of(flat: tuple[Flat, PyTree, Flat], sizes: Sizes) -> PointStep:
+    (solver, options), y, state = flat[0].tree(), flat[1], flat[2].tree()
+    return PointStep(solver, sizes, y, options, state)
+
+
+def _propose(flat: tuple[Flat, PyTree, Flat], sizes: Sizes, stage: int) -> tuple[Array, Any]:
+    return _step_of(flat, sizes).propose(stage)
 
 
 def _searched(
-    step: PointStep, points: Array, rows: Array, proposal: Any, stage: int
-) -> AbstractPointSearch:
-    return step.searched(points, rows, proposal, stage)
+    flat: tuple[Flat, PyTree, Flat],
+    points: Array,
+    rows: Array,
+    proposal: Any,
+    sizes: Sizes,
+    stage: int,
+) -> Flat:
+    return Flat.of(_step_of(flat, sizes).searched(points, rows, proposal, stage))
 
 
 def _counted(
-    step: PointStep, points: Array, rows: Array, after: AbstractPointSearch
-) -> tuple[PyTree, PointState, Bool[Array, ""]]:
+    flat: tuple[Flat, PyTree, Flat], points: Array, rows: Array, after: Flat, sizes: Sizes
+) -> tuple[PyTree, Flat, Bool[Array, ""]]:
     """Also whether the solver wants to stop there."""
-    y, state = step.counted(points, rows, after)
-    return y, state, dataclasses.replace(step, y=y, state=state).over()
+    step = _step_of(flat, sizes)
+    y, state = step.counted(points, rows, after.tree())
+    return y, Flat.of(state), dataclasses.replace(step, y=y, state=state).over()
 
 
-def _rows_of(evaluate: Evaluator, points: Float[Array, "K n"]) -> Float[Array, "K P"]:
-    return evaluate(points)[0]
-
-
-_jit: Any = eqx.filter_jit
-_PARTS = _propose, _searched, _counted
-_WELL = [_jit(part) for part in _PARTS]
-_QUICKLY = [_jit(part, compiler_options=QUICKLY) for part in _PARTS]
-_rows, _rows_quickly = _jit(_rows_of), _jit(_rows_of, compiler_options=QUICKLY)
+# the parts of a step, and which of their arguments are known when compiling
+_PARTS = {_propose: (1, 2), _searched: (4, 5), _counted: (4,)}
+_WELL = [jax.jit(part, static_argnums=known) for part, known in _PARTS.items()]
+_QUICKLY = [
+    jax.jit(part, static_argnums=known, compiler_options=QUICKLY) for part, known in _PARTS.items()
+]
 
 
 def _compiled(state: PointState) -> list[Callable]:

@@ -13,7 +13,7 @@ from jaxtyping import PyTree
 from smoothdiff._black_box import UnknownOutputError
 from smoothdiff._call_checks import check_call, check_number, check_residuals, explained
 from smoothdiff._default_solver import default_solver, share_of_range
-from smoothdiff._host_steps import evaluator, rows_at
+from smoothdiff._host_function import evaluator, rows_at
 from smoothdiff._limits import Limits
 from smoothdiff._look_around import WIDEST, View, look_around
 from smoothdiff._params import as_key, take_apart

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, PyTree
 
 from smoothdiff._covariance import Slopes, balance, slopes
-from smoothdiff._host_steps import evaluator, rows_at, traced
+from smoothdiff._host_function import evaluator, rows_at, traced
 from smoothdiff._parameter_errors import Answer
 from smoothdiff._params import layout_of
 from smoothdiff._programs import is_short
