@@ -25,24 +25,32 @@ CACHE = {"min_compile_time_secs": "0", "min_entry_size_bytes": "-1"}
 # XLA's older, smaller code for fused operations, in one piece, as optimised as any: half the time
 # to compile. Tests of a plain install go without.
 FLAGS = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
-# modules of statistics and closed forms, which hold whatever XLA optimises: quick to compile in the
-# slow part, too
+# modules of statistics and closed forms, which hold whatever XLA optimises, and of studies and
+# examples, which need but run: quick to compile in the slow part, too
 UNOPTIMISED = [
+    "accelerator_study",
     "arguments",
     "baselines",
     "batch",
     "check_gradient",
     "control_variate",
+    "docs",
     "filtered_adam",
     "grid_filters",
     "leave_out",
+    "look",
     "mesh_filters",
+    "mesh_scenes",
+    "methods",
     "noisy",
+    "returned_point",
     "samplers",
     "stderr",
     "support",
     "transforms",
     "unbiased",
+    "variance_benchmark",
+    "zerograds_report",
 ]
 
 

@@ -2,15 +2,14 @@
 
 import ast
 import inspect
-import os
+import multiprocessing
 import pkgutil
 import re
 import statistics
-import subprocess
-import sys
 from pathlib import Path
 
 import pages
+import pasted
 import pytest
 from pages import DOCS, README, ROOT
 
@@ -32,26 +31,35 @@ def named(page):
     return str(page.relative_to(ROOT))
 
 
-def run(block, folder, environment):
+@pytest.fixture(scope="module")
+def context():
+    """Processes that have imported everything, and have not started JAX."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["pasted"])
+    return context
+
+
+def run(block, folder, context):
     """Runs a block as its reader would: pasted into a file in an empty folder."""
-    (folder / "pasted.py").write_text(
-        block.code + "\n" if block.page == README else START + block.code
-    )
-    env = {**os.environ, **environment}
-    ran = subprocess.run(
-        [sys.executable, "pasted.py"], cwd=folder, env=env, capture_output=True, text=True
-    )
-    missing = re.search(r"ModuleNotFoundError: No module named '(\w+)", ran.stderr)
+    code = block.code + "\n" if block.page == README else START + block.code
+    (folder / pasted.CODE).write_text(code)
+    # most of the time is compiling
+    quick = {"jax_disable_most_optimizations": True, "jax_traceback_in_locations_limit": 0}
+    process = context.Process(target=pasted.run, args=(folder, quick))
+    process.start()
+    process.join()
+    errors = (folder / pasted.ERRORS).read_text()
+    missing = re.search(r"ModuleNotFoundError: No module named '(\w+)", errors)
     if missing and missing[1] not in ("smoothdiff", "benchmarks"):
         pytest.skip(f"{missing[1]} is not installed")
-    assert ran.returncode == 0, ran.stderr
-    return ran.stdout
+    assert process.exitcode == 0, errors
+    return (folder / pasted.OUT).read_text()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("block", [b for b in CODE if not b.why_not], ids=str)
-def test_examples_run_alone(block, tmp_path, quickly_compiled):
-    printed = run(block, tmp_path, quickly_compiled)
+def test_examples_run_alone(block, tmp_path, context):
+    printed = run(block, tmp_path, context)
     for said in re.findall(r"print\(.*\)  # close to \[(.*)\]", block.code):
         shown = re.search(r"\[(.*?)\]", printed)
         assert shown, printed
