@@ -1,5 +1,6 @@
 """What every test runs under: strict dtypes and ranks, warnings as errors, x64 off by default."""
 
+import multiprocessing
 import os
 import shutil
 import subprocess
@@ -82,6 +83,14 @@ def pytest_configure(config):
 def quickly_compiled():
     """The environment of a process of its own that compiles as the quick part does."""
     return {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1", "JAX_TRACEBACK_IN_LOCATIONS_LIMIT": "0"}
+
+
+@pytest.fixture(scope="session")
+def context():
+    """Processes that have imported everything, and have not started JAX."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["killed_runs", "pasted"])
+    return context
 
 
 @pytest.fixture(scope="session")

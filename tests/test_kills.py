@@ -23,14 +23,6 @@ NAMES = list(killed_runs.RUNS)
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module")
-def context():
-    """Processes that have imported everything, and have not started JAX."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["killed_runs"])
-    return context
-
-
 def begin(context, name, folder):
     """A process in its run."""
     (folder / "begun").unlink(missing_ok=True)

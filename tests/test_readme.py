@@ -2,7 +2,6 @@
 
 import ast
 import inspect
-import multiprocessing
 import pkgutil
 import re
 import statistics
@@ -29,14 +28,6 @@ START = "import matplotlib; matplotlib.use('agg')\n"
 
 def named(page):
     return str(page.relative_to(ROOT))
-
-
-@pytest.fixture(scope="module")
-def context():
-    """Processes that have imported everything, and have not started JAX."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["pasted"])
-    return context
 
 
 def run(block, folder, context):
