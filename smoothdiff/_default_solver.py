@@ -56,10 +56,9 @@ def default_solver(
     """The rule that `minimise` and `least_squares` state.
 
     `anywhere` says that no sigma is the user's, who does not ask to look around the start; `until`
-    that there is a target, so that one search follows another. What fails is left out, as nobody
-    chose where the points are.
+    that there is a target, so that one search follows another where all is bounded. What fails is
+    left out, as nobody chose where the points are.
     """
-    restarts = _UNTIL if until else 0
     usual = _usual(y, bounds, share_of_range(y, residuals, support))
     if sigma is None:
         sigma = usual
@@ -72,12 +71,13 @@ def default_solver(
             sigma = jax.tree.map(lambda s, d: d if s is None else s, full, usual, is_leaf=_is_none)
     if residuals:
         if support is None:
-            return GaussNewton(sigma, restarts=restarts, nonfinite="drop")
+            return GaussNewton(sigma, nonfinite="drop")
         if anywhere and _all_bounded(y, bounds) and _few_on_a_term(y, support):
             return LocalCrossEntropy(support, nonfinite="drop")
         return LocalGaussNewton(sigma, support, nonfinite="drop")
     # with more parameters a quadratic model takes too many evaluations
     if NewtonCG(1.0).sizes(y) is not None:
+        restarts = _UNTIL if until and _all_bounded(y, bounds) else 0
         return NewtonCG(sigma, restarts=restarts, nonfinite="drop")
     optim = optax.chain(optax.scale_by_adam(), _in_sigmas(sigma))
     return FirstOrder(optim, sigma, adaptive=not callable(sigma), nonfinite="drop")

@@ -88,8 +88,9 @@ def minimise(
             an optimistix minimiser that is given one of these, such as `BestSoFarMinimiser`.
         sigma: the smoothing width of the default solver, in the units of the parameters: how far
             from y0 to look at first. A number or a pytree like the parameters.
-        target: a value that is good enough: the run ends where one as low was seen. Until then the
-            default solver has `restarts`: where a search ends, another begins elsewhere.
+        target: a value that is good enough: the run ends where one as low was seen. If all bounds
+            are finite, the default `NewtonCG` has `restarts`: until then, or a limit, one search
+            follows another.
         max_evaluations: the most evaluations of `fun`, never exceeded. Some are set aside to judge
             the result under noise. Where the function is called between steps, one tells whether it
             has noise, and if not, steps take the others; else they may stay unused. If neither this
@@ -118,7 +119,8 @@ def minimise(
             `max_evaluations` it goes on. The file is written as often as is cheap, and at the end,
             whatever ended the run; a warning says if that fails. A run is continued only if the
             call is the same, numbers and code included, and if `fun` gives the same value again at
-            the lowest point. That evaluation is not counted.
+            the lowest point. That evaluation is not counted. A `target` may change, but within
+            bounds not come or go, as the default solver would.
 
     Returns:
         A `Result`.
@@ -187,7 +189,7 @@ def least_squares(
         sigma: as for `minimise`. But with fewer than 100 parameters and without a support, the
             default is two fifths of a parameter's range: residuals of points far apart tell most.
         support: which residuals each parameter may move, as for `LocalGaussNewton`.
-        target: as for `minimise`; half the sum of squares.
+        target: a value of half the sum of squares that is good enough.
         max_evaluations: as for `minimise`.
         max_steps: as for `minimise`.
         max_seconds: as for `minimise`.

@@ -54,6 +54,27 @@ def test_a_start_without_a_number_asks_for_nothing_nearer():
     assert evaluated == [0, 1, 2, 3]
 
 
+@pytest.mark.parametrize("count", [1, 3])
+def test_of_two_sides_those_that_fail_come_nearer_together(count):
+    first, sides = (
+        FirstPoints.start(jnp.zeros(2), 2),
+        jnp.kron(jnp.eye(2), jnp.array([[1.0], [-1]])),
+    )
+    others, seen = jnp.full((count, 2), 9.0), []
+
+    def all_of(first):
+        while not first.done():
+            seen.extend(np.asarray(first.points(sides, lambda: others, count)).tolist())
+            first = first.known(count)
+        return first
+
+    first = all_of(all_of(first).again(jnp.array([False, True]), 0.1))
+    once, nearer = [[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], [[0, 1], [0, -1]]
+    assert [point for point in seen if point != [9, 9]] == once + nearer
+    assert len(seen) == -(-5 // count) * count + -(-2 // count) * count
+    np.testing.assert_allclose(first.reach, [1, 0.1])
+
+
 def model(y, _):
     """A decay whose rate is a thousand times as small as its amplitude, as in NIST's KIRBY2."""
     t = jnp.linspace(0, 100.0, 40)

@@ -87,7 +87,7 @@ ENDS = [
 ]
 
 
-@pytest.mark.parametrize("end", quick_of(range(3), [0]))
+@pytest.mark.parametrize("end", quick_of(range(3), [0]), ids=["number", "much", "none"])
 def test_a_good_minimum_costs_two_points_a_parameter_and_one(end):
     call, solver, fun, more = ENDS[end]
     runs = []

@@ -76,6 +76,22 @@ def test_infinite_values_are_no_trouble():
     np.testing.assert_allclose(scan.found, BEST, atol=0.3)
 
 
+def test_a_parameter_between_equal_bounds_stays_there():
+    points = []
+
+    def seen(y):
+        points.append(np.asarray(y))
+        return np.sum((y - BEST) ** 2)
+
+    box = sd.black_box(seen, jax.ShapeDtypeStruct((), jnp.float32))
+    sides = jnp.array([-3.0, 1.0, -3.0]), jnp.array([3.0, 1.0, 3.0])
+    run = {"solver": sd.NewtonCG(0.6, restarts=9), "bounds": sides, "max_evaluations": 300}
+    sd.minimise(lambda y, _: box(y), jnp.array([2.3, 1.0, 2.3]), key=jax.random.key(0), **run)
+    assert len(points) > 200
+    assert np.all(np.array(points)[:, 1] == 1)
+    assert np.all(np.isfinite(points))
+
+
 def test_a_longer_scan_follows():
     scan = Scan.start(BEST, jnp.asarray(1.0), jnp.ones(3)).again(BEST, jnp.asarray(1.0))
     limits = []

@@ -25,7 +25,8 @@ class FirstPoints(eqx.Module):
     """What is still to be evaluated: `left` counts the tries of the start and of each point.
 
     There are as many points for each parameter, one after the other. `reach` is the length of the
-    step along each parameter, in units of its sigma, and `before` the loss at the start.
+    step along each parameter, in units of its sigma. `before` is the loss at the start, by which
+    `after` tells what is high; with `known` a point has one try.
     """
 
     reach: Float[Array, " n"]

@@ -152,6 +152,8 @@ class Scan(eqx.Module):
         best = jnp.argmin(values)
         away = jnp.abs(places - places[best])
         nearest = jnp.min(jnp.where(away > 0, away, jnp.inf))
+        # a parameter between equal bounds has no other place
+        nearest = jnp.where(jnp.isfinite(nearest), nearest, self.nearest[at])
         # the lowest place that is no neighbour: nearby, parameters may seem to act alone
         far = jnp.abs(places - self.base[at]) >= jnp.abs(places[1] - places[0]) / _TRY
         other = jnp.argmin(jnp.asarray(jnp.where(far, values, jnp.inf)))

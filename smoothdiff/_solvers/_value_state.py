@@ -158,7 +158,8 @@ class ValueState(AbstractPointSearch):
         best, _, fun = history.best(self.start)
         known = jnp.any(history.valid & ~jnp.any(moved, axis=1))
         first = where(known, nearer, nearer.around(fun))
-        anew = self.anew(params, jnp.where(known, self.start, best), first, jnp.ones_like(fun))
+        # with the radius that a pilot found, as there was no step since
+        anew = self.anew(params, jnp.where(known, self.start, best), first, self.trust.radius)
         anew = dataclasses.replace(anew, evaluated=self.evaluated)
         return where(jnp.any(history.valid) & jnp.any(failed), anew, over)
 
@@ -218,13 +219,16 @@ class ValueState(AbstractPointSearch):
     ) -> list[Float[Array, " n"]]:
         """The lowest point, with parameters that changed nothing back at the start.
 
-        If there are none, the center: with noise the lowest point owes much to luck, it little.
+        If there are none, the center of the first search: with noise the lowest point owes much to
+        luck, it little.
         """
         if self.average is not None:
             return super().candidates(start, lowest)
         ignored = self.ignored()
         back = jnp.where(ignored, start, lowest)
-        return [jnp.where(jnp.any(ignored), back, self.center.theta)]
+        # a later search may have another minimum
+        center = jnp.where(self.searches == 0, self.center.theta, lowest)
+        return [jnp.where(jnp.any(ignored), back, center)]
 
     def round(self) -> Int[Array, ""]:
         """So many rounds of samples."""
