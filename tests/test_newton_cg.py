@@ -167,6 +167,7 @@ def test_a_quadratic_takes_12_evaluations(seeds, dtype):
         assert distance(result.history[-1].y, target) < 0.02, seed
 
 
+@pytest.mark.slow
 @few_seeds
 def test_rosenbrocks_valley_is_followed_to_its_end(seeds, x64):
     for seed in seeds:

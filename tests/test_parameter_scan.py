@@ -76,6 +76,7 @@ def test_infinite_values_are_no_trouble():
     np.testing.assert_allclose(scan.found, BEST, atol=0.3)
 
 
+@pytest.mark.slow
 def test_a_parameter_between_equal_bounds_stays_there():
     points = []
 
