@@ -30,7 +30,7 @@ class FirstPoints(eqx.Module):
     """
 
     reach: Float[Array, " n"]
-    left: Int[Array, " m+1"]
+    left: Int[Array, " points"]
     before: Float[Array, ""]
 
     @staticmethod
