@@ -44,6 +44,7 @@ UNOPTIMISED = [
     "mesh_scenes",
     "methods",
     "noisy",
+    "optimistix",
     "returned_point",
     "samplers",
     "stderr",
@@ -51,6 +52,7 @@ UNOPTIMISED = [
     "transforms",
     "unbiased",
     "variance_benchmark",
+    "zerograds",
     "zerograds_report",
 ]
 
