@@ -108,14 +108,17 @@ def knows(flags):
     return tried.returncode == 0
 
 
+def compiles_quickly(request):
+    """Whether the tests of a module do."""
+    name = request.module.__name__.rpartition("test_")[2]
+    return request.config.option.markexpr != "slow" or name in UNOPTIMISED
+
+
 @pytest.fixture(autouse=True, scope="module")
 def forget_compiled(request):
     """Drops what a module has compiled: kept, it adds up to gigabytes."""
-    name = request.module.__name__.rpartition("test_")[2]
-    quick = request.config.option.markexpr != "slow"
-    jax.config.update("jax_disable_most_optimizations", quick or name in UNOPTIMISED)
+    jax.config.update("jax_disable_most_optimizations", compiles_quickly(request))
     yield
-    jax.config.update("jax_disable_most_optimizations", quick)
     jax.clear_caches()
 
 
@@ -132,11 +135,11 @@ def dtype(request):
 
     It compiles quickly, as float32 does in the quick part: it is the same test.
     """
-    double, before = request.param == "float64", jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", before or double)
+    double, quickly = request.param == "float64", compiles_quickly(request)
+    jax.config.update("jax_disable_most_optimizations", quickly or double)
     with jax.enable_x64(double):
         yield jax.numpy.dtype(request.param)
-    jax.config.update("jax_disable_most_optimizations", before)
+    jax.config.update("jax_disable_most_optimizations", quickly)
 
 
 @pytest.fixture
