@@ -59,6 +59,7 @@ def default_solver(
     that there is a target, so that one search follows another where all is bounded. What fails is
     left out, as nobody chose where the points are.
     """
+    all_bounded = _all_bounded(y, bounds)
     usual = _usual(y, bounds, share_of_range(y, residuals, support))
     if sigma is None:
         sigma = usual
@@ -71,13 +72,14 @@ def default_solver(
             sigma = jax.tree.map(lambda s, d: d if s is None else s, full, usual, is_leaf=_is_none)
     if residuals:
         if support is None:
-            return GaussNewton(sigma, nonfinite="drop")
-        if anywhere and _all_bounded(y, bounds) and _few_on_a_term(y, support):
+            restarts = _UNTIL if until and GaussNewton(sigma).sizes(y) and all_bounded else 0
+            return GaussNewton(sigma, restarts=restarts, nonfinite="drop")
+        if anywhere and all_bounded and _few_on_a_term(y, support):
             return LocalCrossEntropy(support, nonfinite="drop")
         return LocalGaussNewton(sigma, support, nonfinite="drop")
     # with more parameters a quadratic model takes too many evaluations
     if NewtonCG(1.0).sizes(y) is not None:
-        restarts = _UNTIL if until and _all_bounded(y, bounds) else 0
+        restarts = _UNTIL if until and all_bounded else 0
         return NewtonCG(sigma, restarts=restarts, nonfinite="drop")
     optim = optax.chain(optax.scale_by_adam(), _in_sigmas(sigma))
     return FirstOrder(optim, sigma, adaptive=not callable(sigma), nonfinite="drop")

@@ -89,8 +89,8 @@ def minimise(
         sigma: the smoothing width of the default solver, in the units of the parameters: how far
             from y0 to look at first. A number or a pytree like the parameters.
         target: a value that is good enough: the run ends where one as low was seen. If all bounds
-            are finite, the default `NewtonCG` has `restarts`: until then, or a limit, one search
-            follows another.
+            are finite, the default has `restarts` with fewer than 100 parameters: until then, or a
+            limit, one search follows another.
         max_evaluations: the most evaluations of `fun`, never exceeded. Some are set aside to judge
             the result under noise. Where the function is called between steps, one tells whether it
             has noise, and if not, steps take the others; else they may stay unused. If neither this
@@ -189,7 +189,7 @@ def least_squares(
         sigma: as for `minimise`. But with fewer than 100 parameters and without a support, the
             default is two fifths of a parameter's range: residuals of points far apart tell most.
         support: which residuals each parameter may move, as for `LocalGaussNewton`.
-        target: a value of half the sum of squares that is good enough.
+        target: as for `minimise`, a value of half the sum of squares.
         max_evaluations: as for `minimise`.
         max_steps: as for `minimise`.
         max_seconds: as for `minimise`.

@@ -184,7 +184,7 @@ def kept_residuals(result: Result) -> History | None:
     state = result.state
     if not (isinstance(state, PointState) and result.solver.squares):
         return None
-    history = state.search.history
+    history = state.around_lowest()
     if state.search.average is not None:
         # those with several keys differ by more than slopes do
         history = dataclasses.replace(history, valid=history.valid & False)

@@ -198,7 +198,20 @@ def test_jumps_within_the_further_evaluations_are_named():
         assert np.isnan(more.covariance).all()
 
 
-def test_an_answer_of_an_earlier_search_is_evaluated_again():
+def test_the_search_that_found_the_answer_tells_its_errors():
+    tone = lambda y: y["a"] * jnp.sin(y["b"] * times())
+    truth = {"a": 2.0, "b": 8.0}
+    data = noisy(tone, truth, 0.1)
+    # several frequencies are minima, and with other starts most searches end in the others
+    solver = sd.GaussNewton(0.3, restarts=6, patience=40)
+    bounds = {"a": 0.5, "b": 1.0}, {"a": 4.0, "b": 20.0}
+    result: Any = fitted(tone, data, truth, solver=solver, bounds=bounds, max_evaluations=400)
+    here = np.stack(jax.tree.leaves(result.y))
+    assert not np.any(np.all(np.asarray(result.state.search.history.points) == here, axis=1))
+    np.testing.assert_allclose(result.covariance, expected(tone, result), rtol=0.3, atol=3e-5)
+
+
+def test_an_answer_that_the_history_lost_is_evaluated_again():
     data = noisy(decay, TRUTH, 0.1)
     result = fitted(decay, data, TRUTH, max_steps=25)
     history = result.state.search.history

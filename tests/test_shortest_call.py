@@ -171,12 +171,18 @@ def test_with_a_target_other_searches_follow_a_local_minimum():
         ((-3.0, 3.0), False, True),
         ((-3.0, jnp.inf), False, False),
         (None, False, False),
-        ((-3.0, 3.0), True, False),
+        ((-3.0, 3.0), True, True),
+        ((-jnp.inf, 3.0), True, False),
     ],
 )
 def test_searches_follow_where_they_can_begin_anywhere(bounds, residuals, follow):
     found = [default_solver(jnp.ones(2), bounds, None, residuals, until=u) for u in (False, True)]
     assert [solver.restarts > 0 for solver in found] == [False, follow]
+
+
+def test_no_batches_follow_others():
+    many = default_solver(jnp.ones(100), (-3.0, 3.0), None, True, until=True)
+    assert many.restarts == 0
 
 
 @pytest.mark.slow

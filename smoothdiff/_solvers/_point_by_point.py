@@ -46,13 +46,20 @@ class PointState(eqx.Module):
     """The state of a run: `restarts` counts the searches that may still follow.
 
     `aux` is what the function returned beside its value at the iterate, and zeros before it was
-    evaluated there.
+    evaluated there. `found` has the evaluations of the search before, or the one before it, that
+    went lowest: of residuals, for the errors of parameters, where searches may follow.
     """
 
     progress: Progress
     search: AbstractPointSearch
     restarts: Array
+    found: History | None
     aux: PyTree[Array]
+
+    def around_lowest(self) -> History:
+        """The evaluations of the search that went lowest."""
+        here = self.search.history
+        return here if self.found is None else where(here.is_lower(self.found), here, self.found)
 
 
 def final_evaluations(candidates: int) -> int:
@@ -85,8 +92,10 @@ def init(
         draw = lambda key: _normal_points(solver, key, 1, search.start)
         jax.eval_shape(draw, jax.random.key(0))
     restarts = jnp.asarray(solver.restarts, jnp.int32)
+    empty = jax.tree.map(jnp.zeros_like, search.history)
+    found = empty if solver.squares and solver.restarts else None
     aux = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), aux_struct)
-    return PointState(Progress.start(y, search.start.dtype), search, restarts, aux)
+    return PointState(Progress.start(y, search.start.dtype), search, restarts, found, aux)
 
 
 class PointStep(eqx.Module):
@@ -182,27 +191,33 @@ class PointStep(eqx.Module):
         progress = progress.after(
             self.y, unknown, unknown, params.sigma * width, sizes.step, finite, seen
         )
-        restarts = state.restarts
+        restarts, found = state.restarts, state.found
         if solver.restarts:
             lost = later & ~jnp.any(after.history.valid)
             ended = (restarts > 0) & after.over(sizes) & after.looked()
             # no other search finds less
             again = finite & (ended | lost) & ~least
-            lowest_theta = params.layout.vector(jax.tree.leaves(progress.lowest_y))
-            key = jax.random.fold_in(read_options(self.options)[0], progress.evaluations)
-            place, other = jax.random.split(key)
-            theta = _anywhere(params, place, lowest_theta)
-            start = params.layout.vector(jax.tree.leaves(progress.start_y))
-            lowest_fun = progress.lowest_fun.astype(theta.dtype)
-            anew = after.again(params, theta, start, (lowest_theta, lowest_fun), other)
-            new_y, after = jax.tree.map(
-                lambda a, b: jnp.where(again, a, b),
-                (params.layout.tree(theta), anew),
-                (new_y, after),
-            )
+            now = new_y, after, found
+            new_y, after, found = where(again, self._anew(progress, after), now)
             restarts = restarts - (finite & ended).astype(restarts.dtype)
             restarts = jnp.where(least, 0, restarts)
-        return new_y, PointState(progress, after, restarts, state.aux)
+        return new_y, PointState(progress, after, restarts, found, state.aux)
+
+    def _anew(
+        self, progress: Progress, before: AbstractPointSearch
+    ) -> tuple[PyTree[Array], AbstractPointSearch, History | None]:
+        """The iterate and the state of another search, and the history of the lowest before it."""
+        params = self.params()
+        lowest_theta = params.layout.vector(jax.tree.leaves(progress.lowest_y))
+        key = jax.random.fold_in(read_options(self.options)[0], progress.evaluations)
+        place, other = jax.random.split(key)
+        theta = _anywhere(params, place, lowest_theta)
+        start = params.layout.vector(jax.tree.leaves(progress.start_y))
+        lowest_fun = progress.lowest_fun.astype(theta.dtype)
+        anew = before.again(params, theta, start, (lowest_theta, lowest_fun), other)
+        ended = dataclasses.replace(self.state, search=before)
+        found = None if self.state.found is None else ended.around_lowest()
+        return params.layout.tree(theta), anew, found
 
     def learnt(self, points: Float[Array, "K n"], rows: Float[Array, "K P"]) -> PointState:
         """The state with evaluations that it did not propose."""
@@ -215,7 +230,8 @@ class PointStep(eqx.Module):
         search = eqx.tree_at(lambda s: s.stale, search, jnp.where(lower, 0, search.stale + count))
         seen = Seen(params.layout.tree(point), fun)
         rest = progress.smoothed, progress.stderr, progress.sigma, count, progress.finite, seen
-        return PointState(progress.after(self.y, *rest), search, state.restarts, state.aux)
+        progress = progress.after(self.y, *rest)
+        return dataclasses.replace(state, progress=progress, search=search)
 
     def over(self) -> Bool[Array, ""]:
         """Whether the solver wants to stop here."""
