@@ -265,9 +265,13 @@ class AbstractPointSearch(eqx.Module):
         return where(look.done & is_lower(fun, look.before), anew, more)
 
     def seed(self) -> Int[Array, ""]:
-        """Of the next samples: another one for each round, look, and search after one."""
+        """Of the next samples: another one for each round, look, and search after one.
+
+        Below zero for those that run beside first points, which may come several times.
+        """
         look = self.look
-        return self.round() if look is None else self.round() + look.seed(self.is_looking())
+        seed = self.round() - jnp.where(self.stage == FIRST, self.evaluated, 0)
+        return seed if look is None else seed + look.seed(self.is_looking())
 
     def is_looking(self) -> Bool[Array, ""]:
         """Whether points anywhere come next."""

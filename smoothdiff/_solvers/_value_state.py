@@ -150,8 +150,10 @@ class ValueState(AbstractPointSearch):
         history, newest = self.history, self.evaluated + sizes.step
         recent = jnp.arange(len(history.valid), dtype=jnp.int32) >= len(history.valid) - newest
         moved, valid = history.points != self.start[None], history.valid[:, None]
-        told = jnp.any(moved & valid, axis=0)
-        failed = jnp.any(moved & ~valid & recent[:, None], axis=0) & ~told
+        # where several run at once, others fill the places that are left
+        alone = moved & (jnp.sum(moved, axis=1) == 1)[:, None]
+        told = jnp.any(alone & valid, axis=0)
+        failed = jnp.any(alone & ~valid & recent[:, None], axis=0) & ~told
         failed &= self.first.reach > _NEAREST
         nearer = self.first.again(failed, NEARER)
         # where the start has no value, from a point that has one
