@@ -12,7 +12,8 @@ from jaxtyping import Array, PyTree
 
 from smoothdiff._baselines import AbstractBaseline, Control
 from smoothdiff._draws import Draws
-from smoothdiff._params import Layout, Params
+from smoothdiff._layout import Layout
+from smoothdiff._params import Params
 from smoothdiff._samplers import AbstractSampler
 from smoothdiff._seen import Seen
 from smoothdiff._sharding import shared_out

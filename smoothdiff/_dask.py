@@ -17,8 +17,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from smoothdiff._executors import AllHangError, AtOnce, CallLostError, SuspectError
+from smoothdiff._executors import AtOnce
 from smoothdiff._host_samples import Samples
+from smoothdiff._outcomes import AllHangError, CallLostError, SuspectError
 from smoothdiff._processes import Seconds
 
 # bytes of an array that the workers get once and not with each call, and how many they keep

@@ -10,24 +10,21 @@ import itertools
 import queue
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
 
 from smoothdiff._host_samples import Samples
+from smoothdiff._outcomes import (
+    FAULTS,
+    AllHangError,
+    CallLostError,
+    Late,
+    Outcome,
+    Outcomes,
+    PoolLostError,
+    SuspectError,
+)
 from smoothdiff._processes import NotImportableError, Processes, Seconds
-
-
-class AllHangError(RuntimeError):
-    """Every worker of a pool is in a call that cannot be ended."""
-
-
-class CallLostError(RuntimeError):
-    """A call was lost through no fault of its own."""
-
-
-class SuspectError(RuntimeError):
-    """A call was with its worker when that died, and may or may not be why; the cause says how."""
-
 
 # after these no call can be made
 _ENDS = concurrent.futures.BrokenExecutor, AllHangError, NotImportableError
@@ -35,30 +32,6 @@ _ENDS = concurrent.futures.BrokenExecutor, AllHangError, NotImportableError
 _LOSSES = 5
 # seconds for calls to end that run when others have failed; a later value is kept if all lives on
 _PROMPT = 2.0
-# what may be raised and is a fault of one call; Ctrl-C is none
-FAULTS = Exception, SystemExit
-
-
-class Outcome(NamedTuple):
-    """How a call ended; a call is known by its sample, and None is the one call of a batch."""
-
-    sample: int | None
-    tries: int
-    value: Any
-    error: BaseException | None
-
-
-class PoolLostError(Exception):
-    """An executor takes no more calls; `samples` are those that may have brought it down."""
-
-    def __init__(self, error: BaseException, samples: list[int | None]):
-        super().__init__(f"{type(error).__name__}: {error}")
-        self.samples = samples
-
-
-Outcomes = Generator[Outcome, None, None]
-# told of a sample and what the function returned for it
-Late = Callable[[int | None, Any], None]
 
 
 class InTurn:

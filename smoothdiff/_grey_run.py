@@ -17,7 +17,7 @@ from smoothdiff._grey_cases import CaseSearches, Known, Rendered
 from smoothdiff._grey_lessons import Learner, Lessons, mean_loss
 from smoothdiff._grey_result import GreyRecord, GreyResult
 from smoothdiff._identity import listed
-from smoothdiff._params import Layout
+from smoothdiff._layout import Layout
 from smoothdiff._reraise import reraise
 
 # the share of the time that saving may take

@@ -16,8 +16,9 @@ import jax
 import numpy as np
 
 from smoothdiff._casts import as_promised
-from smoothdiff._executors import Engine, Outcome, Outcomes, PoolLostError
+from smoothdiff._executors import Engine
 from smoothdiff._host_samples import BlackBoxError, Samples
+from smoothdiff._outcomes import Outcome, Outcomes, PoolLostError
 from smoothdiff._processes import NotImportableError
 from smoothdiff._store import Found, Store
 

@@ -10,7 +10,7 @@ from jax.extend.core import ClosedJaxpr
 from jax.sharding import NamedSharding
 from jaxtyping import Array, Float, PyTree
 
-from smoothdiff._params import layout_of
+from smoothdiff._layout import layout_of
 from smoothdiff._programs import QUICKLY
 from smoothdiff._solvers._evaluator import Evaluator
 

@@ -16,8 +16,8 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from smoothdiff._flat import Flat
 from smoothdiff._host_function import evaluator, rows_at, traced
+from smoothdiff._problem import Problem, Trial
 from smoothdiff._programs import QUICKLY, is_short
-from smoothdiff._run import Problem, Trial
 from smoothdiff._solvers._base import smoothed_params
 from smoothdiff._solvers._evaluator import Evaluator
 from smoothdiff._solvers._judgement import Values, differ

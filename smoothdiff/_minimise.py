@@ -1,37 +1,18 @@
-"""`minimise` and `least_squares`: the host loop over the steps of a solver."""
+"""`minimise` and `least_squares`: a solver or the default one, until it ends."""
 
 import os
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
-import equinox as eqx
-import jax
 import optimistix as optx
-from jaxtyping import Array, PyTree
-from tqdm import tqdm
+from jaxtyping import PyTree
 
-from smoothdiff._black_box import UnknownOutputError
 from smoothdiff._call_checks import (
-    check_call,
     check_number,
     check_residuals,
-    check_solver,
-    explained,
 )
-from smoothdiff._default_solver import default_solver, share_of_range
-from smoothdiff._host_samples import BlackBoxError
-from smoothdiff._host_steps import HostProblem
-from smoothdiff._limits import Limits
 from smoothdiff._result import Record, Result
-from smoothdiff._run import Problem, Run, inexact
-from smoothdiff._solvers import AbstractSmoothSolver
-from smoothdiff._solvers._base import write_options
-from smoothdiff._solvers._random_numbers import keyed
-from smoothdiff._solvers._wrapped import Wrapped
-from smoothdiff._unit_space import UnitSpace
-
-# from so many parameters on, the history does without iterates unless it is asked for them
-_MANY = 10_000
+from smoothdiff._solve import Kind, Loop, solve
 
 
 def minimise(
@@ -142,10 +123,10 @@ def minimise(
     Source: own; each solver names its own.
     """
     limits = max_steps, max_evaluations, max_seconds, target
-    kind = optx.AbstractMinimiser, "NewtonCG", check_number
+    kind = Kind(optx.AbstractMinimiser, "NewtonCG", check_number)
     chosen, where = (solver, sigma, None), (space, bounds, takes_key)
-    loop = _Loop(callback, progress, keep_iterates, checkpoint)
-    return _run(kind, fun, y0, args, key, chosen, where, limits, loop)
+    loop = Loop(callback, progress, keep_iterates, checkpoint)
+    return solve(kind, fun, y0, args, key, chosen, where, limits, loop)
 
 
 def least_squares(
@@ -224,96 +205,7 @@ def least_squares(
     Source: own; each solver names its own.
     """
     limits = max_steps, max_evaluations, max_seconds, target
-    kind = optx.AbstractLeastSquaresSolver, "GaussNewton", check_residuals
+    kind = Kind(optx.AbstractLeastSquaresSolver, "GaussNewton", check_residuals)
     chosen, where = (solver, sigma, support), (space, bounds, takes_key)
-    loop = _Loop(callback, progress, keep_iterates, checkpoint)
-    return _run(kind, fun, y0, args, key, chosen, where, limits, loop)
-
-
-class _Loop(NamedTuple):
-    """What is done beside the steps."""
-
-    callback: Callable[[Record], Any] | None
-    progress: bool
-    keep_iterates: bool | None
-    checkpoint: str | os.PathLike | None
-
-
-def _run(
-    kind: tuple[type, str, Callable[[PyTree], None]],
-    fun: Any,
-    y0: PyTree,
-    args: PyTree,
-    key: Any,
-    chosen: tuple[Any, PyTree, Any],
-    where: tuple[PyTree, Any, bool],
-    limits: tuple[Any, ...],
-    loop: _Loop,
-) -> Result:
-    (interface, example, check), (solver, sigma, support) = kind, chosen
-    space, bounds, takes_key = where
-    check_call(fun, y0, bounds, space, takes_key)
-    fun, args = keyed(fun, args, key) if takes_key else (fun, args)
-    units, anywhere = UnitSpace.of(y0, space), sigma is None
-    if space is not None:
-        fun, y0 = units.wrap(fun), units.unit(y0)
-        bounds = units.bounds()
-    y = jax.tree.map(inexact, y0)
-    if solver is None:
-        residuals = interface is optx.AbstractLeastSquaresSolver
-        if space is not None and sigma is None:
-            sigma = units.sigma(share_of_range(y, residuals, support))
-        until = limits[-1] is not None and not takes_key
-        solver = default_solver(y, bounds, sigma, residuals, support, anywhere, until)
-    else:
-        check_solver(solver, interface, example, sigma, support)
-        solver = solver if isinstance(solver, AbstractSmoothSolver) else Wrapped(solver)
-    options = write_options(key, bounds, takes_key)
-    ends = Limits.of(solver, y, *limits)
-    with explained():
-        if solver.sizes(y) is None:
-            problem = Problem(fun, solver, args, options)
-        else:
-            problem = HostProblem.of(fun, solver, args, options, y)
-        problem, state = _begun(problem, y, check)
-    run = Run(problem, y, state, units, _keeps(loop.keep_iterates, y))
-    try:
-        if loop.checkpoint is not None:
-            run.attach(loop.checkpoint)
-        with tqdm(total=ends.expected, initial=run.steps, disable=not loop.progress) as bar:
-            compiled = set()
-            while (reason := run.done() or run.reached(ends)) is None:
-                if (stage := problem.stage(run.state)) not in compiled:
-                    bar.set_description_str("compiling")
-                record = run.step()
-                compiled.add(stage)
-                bar.set_description_str(refresh=False)
-                text = f"{record.evaluations} evaluations, fun = {record.fun:.4g}"
-                bar.set_postfix_str(text, refresh=False)
-                bar.update()
-                if loop.callback is not None and loop.callback(record):
-                    reason = "callback"
-                    break
-        return run.judged(reason)
-    except KeyboardInterrupt:
-        return run.found("interrupted")
-    except (BlackBoxError, jax.errors.JaxRuntimeError) as error:
-        raise run.failed(error) from (error.__cause__ or error)
-    finally:
-        run.save()
-
-
-def _keeps(asked: bool | None, y: PyTree[Array]) -> bool:
-    """Whether the history has the iterates."""
-    return sum(leaf.size for leaf in jax.tree.leaves(y)) < _MANY if asked is None else asked
-
-
-def _begun(problem: Problem, y: PyTree, check: Callable[[PyTree], None]) -> tuple[Problem, Any]:
-    """After an evaluation, which counts, if only that can tell what a black box returns."""
-    try:
-        return problem.begin(y, check)
-    except UnknownOutputError:
-        problem.fun(y, problem.args)
-    problem, state = problem.begin(y, check)
-    count = state.progress.evaluations
-    return problem, eqx.tree_at(lambda s: s.progress.evaluations, state, count + 1)
+    loop = Loop(callback, progress, keep_iterates, checkpoint)
+    return solve(kind, fun, y0, args, key, chosen, where, limits, loop)

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from smoothdiff._covariance import Covariance, covariance, slopes
-from smoothdiff._params import layout_of, side_leaves
+from smoothdiff._layout import layout_of
+from smoothdiff._params import side_leaves
 from smoothdiff._solvers._history import History
 from smoothdiff._unit_space import UnitSpace
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, PyTree
 
 from smoothdiff._batch import Batch
 from smoothdiff._estimate import objective
-from smoothdiff._params import Layout
+from smoothdiff._layout import Layout
 from smoothdiff._products import dot
 from smoothdiff._stderr import grad_stderr, hvp_stderr, value_stderr
 

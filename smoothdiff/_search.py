@@ -10,7 +10,8 @@ from jaxtyping import Array, PyTree
 
 from smoothdiff._default_solver import default_solver, share_of_range
 from smoothdiff._host_steps import HostSteps
-from smoothdiff._params import as_key, layout_of
+from smoothdiff._layout import layout_of
+from smoothdiff._params import as_key
 from smoothdiff._run import inexact
 from smoothdiff._solvers import AbstractSmoothSolver
 from smoothdiff._solvers._base import write_options

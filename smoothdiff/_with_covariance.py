@@ -11,8 +11,8 @@ from jaxtyping import Float, PyTree
 
 from smoothdiff._covariance import Slopes, balance, slopes
 from smoothdiff._host_function import evaluator, rows_at, traced
+from smoothdiff._layout import layout_of
 from smoothdiff._parameter_errors import Answer
-from smoothdiff._params import layout_of
 from smoothdiff._programs import is_short
 from smoothdiff._reraise import reraise
 from smoothdiff._result import NO_COVARIANCE, Result, kept_residuals

@@ -6,8 +6,11 @@ import jax
 import optax
 from jaxtyping import Array, Float, PyTree
 
-from smoothdiff._params import Layout
+from smoothdiff._params import Params
 from smoothdiff._solvers._base import project, promotion
+
+# the default rate, in units of sigma
+_RATE = 0.05
 
 
 def descended(
@@ -33,14 +36,16 @@ def descended(
     return jax.lax.scan(update, (y, opt_state), length=length)[0]
 
 
-def in_units(
-    optim: optax.GradientTransformation, layout: Layout, sigma: Float[Array, " n"]
+def as_optimizer(
+    optim: optax.GradientTransformation | None, params: Params
 ) -> optax.GradientTransformationExtraArgs:
-    """The transformation with its updates in units of each parameter's sigma."""
-    optim = optax.with_extra_args_support(optim)
+    """The user's transformation; without one Adam, in units of each parameter's sigma."""
+    if optim is not None:
+        return optax.with_extra_args_support(optim)
+    adam, layout = optax.adam(_RATE), params.layout
 
-    def update(updates, state, params=None, **extra_args):
-        updates, state = optim.update(updates, state, params, **extra_args)
-        return layout.tree(sigma * layout.vector(jax.tree.leaves(updates))), state
+    def update(updates, state, y=None, **extra):
+        updates, state = adam.update(updates, state, y)
+        return layout.tree(params.sigma * layout.vector(jax.tree.leaves(updates))), state
 
-    return optax.GradientTransformationExtraArgs(optim.init, update)
+    return optax.GradientTransformationExtraArgs(adam.init, update)

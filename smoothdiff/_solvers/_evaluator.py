@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.sharding import NamedSharding
 from jaxtyping import Array, Float, PyTree
 
-from smoothdiff._params import Layout
+from smoothdiff._layout import Layout
 from smoothdiff._sharding import columns_shared_out, shared_out
 
 

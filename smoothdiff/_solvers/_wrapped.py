@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, PyTree
 
-from smoothdiff._params import layout_of
+from smoothdiff._layout import layout_of
 from smoothdiff._seen import Seen
 from smoothdiff._solvers._base import AbstractSmoothSolver, Progress
 from smoothdiff._solvers._evaluator import Evaluator

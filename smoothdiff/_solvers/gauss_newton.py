@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree
 
-from smoothdiff._params import layout_of
+from smoothdiff._layout import layout_of
 from smoothdiff._samplers import AbstractSampler
 from smoothdiff._sharding import as_sharding
 from smoothdiff._solvers import _batch_by_batch, _point_by_point

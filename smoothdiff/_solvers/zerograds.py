@@ -26,7 +26,7 @@ from smoothdiff._solvers._base import (
     stopped,
     unless_failed,
 )
-from smoothdiff._solvers._descent import descended, in_units
+from smoothdiff._solvers._descent import as_optimizer, descended
 from smoothdiff._solvers._judgement import judged, judging, one_by_one
 from smoothdiff._solvers._locality import Locality, inner_width, log, share
 from smoothdiff._solvers._random_numbers import in_step
@@ -34,8 +34,6 @@ from smoothdiff._solvers._replay import Replay
 from smoothdiff._solvers._surrogate_fit import Fit, Settings
 from smoothdiff.surrogates import MLP
 
-# the default rate of the parameters, in units of sigma
-_RATE = 0.05
 # so many small updates in a row count as convergence, as in FirstOrder
 _PATIENCE = 5
 # what the surrogate's key is made with: the number of no step
@@ -152,10 +150,9 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
 
     def __check_init__(self):
         check_settings(self)
-        for name in ("surrogate_optimizer", "optimizer"):
+        for name, left_out in ("surrogate_optimizer", ()), ("optimizer", None):
             optim = getattr(self, name)
-            left_out = optim is None and name == "optimizer"
-            if not left_out and not isinstance(optim, optax.GradientTransformation):
+            if optim is not left_out and not isinstance(optim, optax.GradientTransformation):
                 good = "an optax transformation such as optax.adam(1e-3)"
                 raise TypeError(f"{name} must be {good}: {optim}")
         for name in ("surrogate_steps", "parameter_steps"):
@@ -208,7 +205,7 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
         batches = 1 + self._fitting(params).replay
         replay = Replay.start(batches, self.num_samples, params.theta, f_struct.dtype)
         fit = Fit.start(weights, fitting, replay, params.theta, params.sigma, f_struct.dtype)
-        opt_state = self._descent(params).init(y)
+        opt_state = as_optimizer(self.optimizer, params).init(y)
         return ZeroGradsState(Progress.start(y, f_struct.dtype), fit, opt_state, step)
 
     def _fitting(self, params: Params) -> Settings:
@@ -218,11 +215,6 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
             replay=self.replay,
             up_to_constant=self.up_to_constant,
         )
-
-    def _descent(self, params: Params) -> optax.GradientTransformationExtraArgs:
-        if self.optimizer is not None:
-            return optax.with_extra_args_support(self.optimizer)
-        return in_units(optax.adam(_RATE), params.layout, params.sigma)
 
     def learnt(self, state: ZeroGradsState, y: PyTree[Array]) -> Callable[[PyTree], Array]:
         """The surrogate of a run, as a function of parameters like `y`, in units of the values.
@@ -269,7 +261,7 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
             lambda y: fit.height(surrogate, vector(jax.tree.leaves(y))),
             y,
             state.opt_state,
-            self._descent(params),
+            as_optimizer(self.optimizer, params),
             read_options(options)[1],
             length=self.parameter_steps,
         )
