@@ -42,10 +42,10 @@ def as_optimizer(
     """The user's transformation; without one Adam, in units of each parameter's sigma."""
     if optim is not None:
         return optax.with_extra_args_support(optim)
-    adam, layout = optax.adam(_RATE), params.layout
+    adam, layout, sigma = optax.adam(_RATE), params.layout, params.sigma
 
-    def update(updates, state, y=None, **extra):
-        updates, state = adam.update(updates, state, y)
-        return layout.tree(params.sigma * layout.vector(jax.tree.leaves(updates))), state
+    def update(updates, state, params=None, **extra_args):
+        updates, state = adam.update(updates, state, params)
+        return layout.tree(sigma * layout.vector(jax.tree.leaves(updates))), state
 
     return optax.GradientTransformationExtraArgs(adam.init, update)
