@@ -16,7 +16,7 @@ from benchmarks._reached import Took, alike, machines, reached, took
 from benchmarks._summary import without_one
 from benchmarks._task import Method
 from benchmarks.studies.report import _chart, _compare, _finder, _overall, _scene
-from benchmarks.studies.report._scene import FEW
+from benchmarks.studies.report._scene import MANY
 from benchmarks.studies.report._standing import first, loses
 
 
@@ -25,10 +25,10 @@ from benchmarks.studies.report._standing import first, loses
     [
         (2, {"newton_cg": 2, "gauss_newton": 3}, "gauss_newton", "newton_cg"),
         (2, {"newton_cg": 2, "gauss_newton": "no residuals", "fr22": 1}, "newton_cg", "newton_cg"),
-        (FEW + 1, {"gauss_newton": 2, "local_first_order": 1}, "gauss_newton", None),
-        (FEW + 1, {"gauss_newton": 2, "local_gauss_newton": 3}, "local_gauss_newton", None),
-        (FEW + 1, {"newton_cg": 1, "local_first_order": 9}, "local_first_order", None),
-        (FEW + 1, {"newton_cg": 1, "first_order": 3}, "first_order", "first_order"),
+        (MANY, {"gauss_newton": 2, "local_first_order": 1}, "gauss_newton", None),
+        (MANY, {"gauss_newton": 2, "local_gauss_newton": 3}, "local_gauss_newton", None),
+        (MANY, {"newton_cg": 1, "local_first_order": 9}, "local_first_order", None),
+        (MANY, {"newton_cg": 1, "first_order": 3}, "first_order", "first_order"),
         (2, {"fr22": 2}, None, None),
     ],
 )
