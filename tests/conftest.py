@@ -26,41 +26,24 @@ CACHE = {"min_compile_time_secs": "0", "min_entry_size_bytes": "-1"}
 # XLA's older, smaller code for fused operations, in one piece, as optimised as any: half the time
 # to compile. Tests of a plain install go without.
 FLAGS = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
-# modules of statistics and closed forms, which hold whatever XLA optimises, and of studies and
-# examples, which need but run: quick to compile in the slow part, too
-UNOPTIMISED = [
-    "accelerator_study",
-    "arguments",
-    "baselines",
-    "batch",
-    "check_gradient",
-    "control_variate",
-    "docs",
-    "filtered_adam",
-    "grid_filters",
-    "leave_out",
-    "look",
-    "mesh_filters",
-    "mesh_scenes",
-    "methods",
-    "noisy",
-    "optimistix",
-    "returned_point",
-    "samplers",
-    "stderr",
-    "support",
+# modules of what optimisations may change, rounding above all: the slow part compiles them as users'
+# programs are. Statistics, closed forms and studies hold whatever XLA does.
+OPTIMISED = [
+    "extreme",
+    "fuzz",
+    "fuzz_runs",
+    "gauss_newton",
+    "numerics",
+    "precision",
+    "tasks",
     "transforms",
-    "unbiased",
-    "variance_benchmark",
-    "zerograds",
-    "zerograds_report",
 ]
 
 
 def pytest_configure(config):
-    """The quick part compiles with few optimisations, `pytest -m slow` with all.
+    """The quick part compiles with few optimisations, `pytest -m slow` some modules with all.
 
-    Most of a quick test is compiling, which takes less than half as long.
+    Most of a test is compiling, which takes less than half as long.
     """
     quick = config.option.markexpr != "slow"
     jax.config.update("jax_disable_most_optimizations", quick)
@@ -111,7 +94,7 @@ def knows(flags):
 def compiles_quickly(request):
     """Whether the tests of a module do."""
     name = request.module.__name__.rpartition("test_")[2]
-    return request.config.option.markexpr != "slow" or name in UNOPTIMISED
+    return request.config.option.markexpr != "slow" or name not in OPTIMISED
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -197,20 +197,22 @@ def fit(
     apart = spread[:, None] + spread[None] - 2 * gram
     radial = jnp.exp(-jnp.maximum(apart, 0) / 2)
     weights = closeness[:, None] * closeness[None]
+    size = values.size
+    parts = jnp.stack([gram, gram**2, radial]) * weights[None]
+    parts = jnp.concatenate([parts, jnp.eye(size, dtype=dtype)[None]]).reshape(-1, size**2)
     sides = closeness[:, None] * jnp.stack([jnp.ones_like(targets), targets], axis=1)
 
     def solve(choice: Array) -> tuple[Array, ...]:
-        curved, rest, ridge = choice[0], choice[1], choice[2]
-        kernel = weights * (gram + curved * gram**2 + rest * radial)
-        factor = jnp.linalg.cholesky(kernel + ridge * jnp.eye(values.size, dtype=dtype))
-        solved = jax.scipy.linalg.cho_solve((factor, True), sides)
-        mass = dot(sides[:, 0], solved[:, 0])
-        constant = dot(sides[:, 0], solved[:, 1]) / mass
-        left = solved[:, 1] - constant * solved[:, 0]
-        misfit = dot(sides[:, 1] - constant * sides[:, 0], left) / count
-        misfit = jnp.maximum(misfit, jnp.finfo(dtype).tiny)
+        # a product takes no longer where it is compiled quickly
+        kernel = dot(jnp.append(jnp.ones(1, dtype), choice), parts).reshape(size, size)
+        factor = jax.lax.linalg.cholesky(kernel, symmetrize_input=False)
+        ones, values = jax.scipy.linalg.solve_triangular(factor, sides, lower=True).T
+        mass = dot(ones, ones)
+        constant = dot(ones, values) / mass
+        left = values - constant * ones
+        misfit = jnp.maximum(dot(left, left) / count, jnp.finfo(dtype).tiny)
         volume = jnp.sum(jnp.log(jnp.diagonal(factor)))
-        volume -= (values.size - count) / 2 * jnp.log(ridge)
+        volume -= (size - count) / 2 * jnp.log(choice[2])
         evidence = -(count - 1) / 2 * jnp.log(misfit) - volume - jnp.log(mass) / 2
         return evidence, left, constant, misfit, factor
 
@@ -220,6 +222,7 @@ def fit(
     evidence: Array = jax.lax.map(lambda choice: solve(choice)[0], table)
     choice = table[jnp.argmax(jnp.where(jnp.isfinite(evidence), evidence, -jnp.inf))]
     _, left, constant, misfit, factor = solve(choice)
+    left = jax.scipy.linalg.solve_triangular(factor, left, lower=True, trans=1)
     return ScalarFit(
         points=points,
         coefficients=scale * closeness * left,
