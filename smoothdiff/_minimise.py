@@ -75,8 +75,9 @@ def minimise(
         max_evaluations: the most evaluations of `fun`, never exceeded. Some are set aside to judge
             the result under noise. Where the function is called between steps, one tells whether it
             has noise, and if not, steps take the others; else they may stay unused. If neither this
-            nor `max_steps` is given, the limit is 200 (n + 1) for `NewtonCG` and `GaussNewton` with
-            n < 100 parameters, which mostly end before by themselves, and 256 steps for others.
+            nor `max_steps` is given, the limit is 256 steps, but for `NewtonCG` and `GaussNewton`
+            with n < 100 parameters, which mostly end before by themselves, 200 (n + 1) and what
+            the judgement takes, `restarts` included.
         max_steps: steps after which to stop.
         max_seconds: seconds after which no further step begins.
         space: what each parameter may be, such as `Range(1e-3, 10, log=True)`: one space, or a

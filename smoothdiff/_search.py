@@ -34,7 +34,7 @@ class Search:
     asked for before all are told, so no worker waits for the slowest. Values at points that were
     never asked for teach as well, so earlier evaluations can be told at the beginning. To save a
     search, keep its points and values: a new search with the same key that is told the same values
-    in the same order goes on where the old one was.
+    in the same calls, with none still out, goes on where the old one was.
 
     `ask` gives what the model wants next. If that is still out, further points follow: in the local
     model shorter and longer steps, in a round of samples its next ones. A point that nobody tells

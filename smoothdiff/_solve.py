@@ -1,5 +1,6 @@
 """The host loop around the steps of a solver, from what a call says to its result."""
 
+import contextlib
 import os
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -138,10 +139,10 @@ def _keeps(asked: bool | None, y: PyTree[Array]) -> bool:
 
 def _begun(problem: Problem, y: PyTree, check: Callable[[PyTree], None]) -> tuple[Problem, Any]:
     """After an evaluation, which counts, if only that can tell what a black box returns."""
-    try:
+    # what that raises has nothing to do with the error that is caught
+    with contextlib.suppress(UnknownOutputError):
         return problem.begin(y, check)
-    except UnknownOutputError:
-        problem.fun(y, problem.args)
+    problem.fun(y, problem.args)
     problem, state = problem.begin(y, check)
     count = state.progress.evaluations
     return problem, eqx.tree_at(lambda s: s.progress.evaluations, state, count + 1)

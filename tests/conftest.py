@@ -26,8 +26,8 @@ CACHE = {"min_compile_time_secs": "0", "min_entry_size_bytes": "-1"}
 # XLA's older, smaller code for fused operations, in one piece, as optimised as any: half the time
 # to compile. Tests of a plain install go without.
 FLAGS = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
-# modules of what optimisations may change, rounding above all: the slow part compiles them as users'
-# programs are. Statistics, closed forms and studies hold whatever XLA does.
+# modules of what optimisations may change, rounding above all: the slow part compiles them as for
+# users. Statistics, closed forms and studies hold whatever XLA does.
 OPTIMISED = [
     "extreme",
     "fuzz",

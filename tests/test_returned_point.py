@@ -326,3 +326,28 @@ def test_a_search_that_ends_far_away_on_a_plateau_is_judged():
     flat = lambda y, args: jnp.full(1, 7.0) + 0 * y
     found = sd.least_squares(flat, jnp.array([40.0]), key=KEY, solver=solver)
     assert found.fun == 24.5
+
+
+@pytest.mark.parametrize("solver", quick_of(POINT_BY_POINT, ["newton", "gauss-newton"]))
+def test_a_function_that_fails_at_the_end_costs_nothing_that_was_found(solver):
+    run = Run(SETTINGS[solver]())
+    # the call after the last step's is the first of the judgement
+    steps = run(tail, max_evaluations=40).history[-1].evaluations
+
+    def failing(y):
+        works = len(HOST.points) < steps or np.array_equal(y, START)
+        return tail(y) * (1 if works else np.nan)
+
+    result = run(failing, max_evaluations=40)
+    assert result.reason == "max_evaluations"
+    assert len(HOST.points) > steps
+    lowest = np.nanargmin(HOST.values)
+    assert result.fun == pytest.approx(HOST.values[lowest], rel=1e-6)
+    np.testing.assert_array_equal(result.y, HOST.points[lowest])
+
+
+@pytest.mark.parametrize("solver", quick_of(SETTINGS, ["chunks", "newton", "gauss-newton"]))
+def test_where_nothing_is_lower_the_start_is_the_answer(solver):
+    result = Run(SETTINGS[solver]())(lambda y: np.ones(2), max_evaluations=150)
+    np.testing.assert_array_equal(result.y, START)
+    assert result.reason != "noise"

@@ -62,6 +62,11 @@ class Progress(eqx.Module):
             start_y=y,
         )
 
+    def at_start(self) -> Bool[Array, ""]:
+        """Whether nothing was lower than the start."""
+        same = jax.tree.map(lambda a, b: jnp.all(a == b), self.lowest_y, self.start_y)
+        return jnp.all(jnp.stack(jax.tree.leaves(same)))
+
     def after(
         self,
         y: PyTree[Array],
@@ -82,8 +87,10 @@ class Progress(eqx.Module):
         better = finite & (smoothed < self.best_smoothed)
         best = (y, smoothed), (self.best_y, self.best_smoothed)
         best_y, best_smoothed = jax.tree.map(lambda a, b: jnp.where(better, a, b), *best)
-        # of equals the last: on a plateau that is further from where the run came in
-        lower = jnp.isfinite(seen.value) & (seen.value <= self.lowest_fun)
+        # of equals the last: on a plateau that is further from where the run came in. But the start
+        # stays until something is lower: a function may be constant
+        equal = (seen.value == self.lowest_fun) & ~self.at_start()
+        lower = jnp.isfinite(seen.value) & ((seen.value < self.lowest_fun) | equal)
         there = (seen.point, seen.value.astype(dtype)), (self.lowest_y, self.lowest_fun)
         lowest_y, lowest_fun = jax.tree.map(lambda a, b: jnp.where(lower, a, b), *there)
         return Progress(

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -65,8 +66,9 @@ def judged(
     Returns:
         The point, and the statistics: `fun`, the function there; `smoothed` and `stderr`, from the
         last batch; and the `evaluations` of the run. A candidate at which the function is not
-        finite loses; of equals the first of the `new` ones wins, as on a plateau an iterate is
-        further from the edges than a sample.
+        finite loses, unless it was before; of equals the first of the `new` ones wins, as on a
+        plateau an iterate is further from the edges than a sample, but none from a start than
+        which nothing was lower.
     """
     if values.takes_key:
         new, old = [*new, *old], []
@@ -92,7 +94,10 @@ def judged(
     done: Array
     found: Array
     done, found = loop(more, evaluated, none)
-    y, fun, differs = (_clear_winner if values.takes_key else _winner)(found, points)
+    if values.takes_key:
+        y, fun, differs = _clear_winner(found, points)
+    else:
+        y, fun, differs = _winner(found, points, progress, each - 1)
 
     smoothed, stderr, seen = estimate(y)
     last = seen.value.astype(dtype)
@@ -102,10 +107,18 @@ def judged(
     return y, {"fun": fun, "smoothed": smoothed, "stderr": stderr, "evaluations": evaluations}
 
 
-@jax.jit
-def _winner(found: Float[Array, " m"], points: PyTree[Array]) -> tuple[PyTree[Array], Array, Array]:
-    """The point with the lowest mean of all its values, that mean, and whether values differ."""
+@partial(jax.jit, static_argnums=3)
+def _winner(
+    found: Float[Array, " m"], points: PyTree[Array], progress: Progress, lowest: int
+) -> tuple[PyTree[Array], Array, Array]:
+    """The point with the lowest mean of all its values, that mean, and whether values differ.
+
+    One of the points is the lowest of the run.
+    """
     count = len(jax.tree.leaves(points)[0])
+    # where it failed again and again, its first value is all that is known
+    failed = ~jnp.any(jnp.isfinite(found[lowest::count]))
+    found = found.at[lowest].set(jnp.where(failed, progress.lowest_fun, found[lowest]))
     table = found[: _REPEATS * count].reshape(_REPEATS, count)
     finite = jnp.isfinite(table)
     least = jnp.min(jnp.where(finite, table, jnp.inf), axis=0)
@@ -114,6 +127,9 @@ def _winner(found: Float[Array, " m"], points: PyTree[Array]) -> tuple[PyTree[Ar
     times = jnp.maximum(jnp.sum(finite, axis=0), 1).astype(found.dtype)
     means = least + jnp.sum(above, axis=0) / times
     winner = jnp.argmin(means)
+    # where nothing was lower than the start, what is as low is no better
+    stays = progress.at_start() & (means[lowest] <= means[winner])
+    winner = jnp.where(stays, lowest, winner)
     return jax.tree.map(lambda a: a[winner], points), means[winner], jnp.any(above > 0)
 
 

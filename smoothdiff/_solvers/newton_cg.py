@@ -211,12 +211,17 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         return stopped(state.progress, over, converged)
 
     def reason(self, state: Any) -> str:
-        """Small steps, a gradient that is all noise, or too many evaluations for nothing."""
+        """Small steps, a gradient that is all noise, or too many evaluations for nothing.
+
+        Where all values are the same there is no noise.
+        """
         if isinstance(state, _newton_batches.NewtonBatchState):
             return "noise" if state.center.trust.insignificant else "converged"
         if state.search.converged():
             return "converged"
-        return "noise" if state.search.center.trust.insignificant else "stalled"
+        search = state.search
+        noise = search.center.trust.insignificant & ~search.plateau(jnp.zeros_like(search.start))
+        return "noise" if noise else "stalled"
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         """Judges the best point, with noise beside others."""
