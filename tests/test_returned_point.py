@@ -328,22 +328,22 @@ def test_a_search_that_ends_far_away_on_a_plateau_is_judged():
     assert found.fun == 24.5
 
 
-@pytest.mark.parametrize("solver", quick_of(POINT_BY_POINT, ["newton", "gauss-newton"]))
+@pytest.mark.parametrize("solver", ["newton", "gauss-newton"])
 def test_a_function_that_fails_at_the_end_costs_nothing_that_was_found(solver):
     run = Run(SETTINGS[solver]())
     # the call after the last step's is the first of the judgement
-    steps = run(tail, max_evaluations=40).history[-1].evaluations
+    steps = run(bowl, max_evaluations=900).history[-1].evaluations
 
     def failing(y):
         works = len(HOST.points) < steps or np.array_equal(y, START)
-        return tail(y) * (1 if works else np.nan)
+        return bowl(y) * (1 if works else np.nan)
 
-    result = run(failing, max_evaluations=40)
-    assert result.reason == "max_evaluations"
-    assert len(HOST.points) > steps
-    lowest = np.nanargmin(HOST.values)
-    assert result.fun == pytest.approx(HOST.values[lowest], rel=1e-6)
-    np.testing.assert_array_equal(result.y, HOST.points[lowest])
+    result = run(failing, max_evaluations=900)
+    assert steps < len(HOST.points) < 900
+    lowest = np.nanmin(HOST.values)
+    assert result.fun == pytest.approx(lowest, rel=1e-6)
+    known = zip(HOST.points, HOST.values, strict=True)
+    assert any(value == lowest and np.array_equal(result.y, y) for y, value in known)
 
 
 @pytest.mark.parametrize("solver", quick_of(SETTINGS, ["chunks", "newton", "gauss-newton"]))

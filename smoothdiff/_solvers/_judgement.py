@@ -116,8 +116,8 @@ def _winner(
     One of the points is the lowest of the run.
     """
     count = len(jax.tree.leaves(points)[0])
-    # where it failed again and again, its first value is all that is known
-    failed = ~jnp.any(jnp.isfinite(found[lowest::count]))
+    # where it failed again and again, and others did not, its first value is all that is known
+    failed = ~jnp.any(jnp.isfinite(found[lowest::count])) & jnp.any(jnp.isfinite(found))
     found = found.at[lowest].set(jnp.where(failed, progress.lowest_fun, found[lowest]))
     table = found[: _REPEATS * count].reshape(_REPEATS, count)
     finite = jnp.isfinite(table)
