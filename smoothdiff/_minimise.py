@@ -70,14 +70,14 @@ def minimise(
         sigma: the smoothing width of the default solver, in the units of the parameters: how far
             from y0 to look at first. A number or a pytree like the parameters.
         target: a value that is good enough: the run ends where one as low was seen. If all bounds
-            are finite, the default has `restarts` with fewer than 100 parameters: until then, or a
-            limit, one search follows another.
+            are finite, the default `NewtonCG` or `GaussNewton` has `restarts` with fewer than 100
+            parameters, unless `fun` takes a key: one search follows another until then, or a limit.
         max_evaluations: the most evaluations of `fun`, never exceeded. Some are set aside to judge
             the result under noise. Where the function is called between steps, one tells whether it
             has noise, and if not, steps take the others; else they may stay unused. If neither this
-            nor `max_steps` is given, the limit is 256 steps, but for `NewtonCG` and `GaussNewton`
-            with n < 100 parameters, which mostly end before by themselves, 200 (n + 1) and what
-            the judgement takes, `restarts` included.
+            nor `max_steps` is given, the limit is 256 steps. For `NewtonCG` and `GaussNewton` with
+            n < 100 parameters it is 200 (n + 1), for all `restarts` together, and what the
+            judgement takes. A single search mostly ends before.
         max_steps: steps after which to stop.
         max_seconds: seconds after which no further step begins.
         space: what each parameter may be, such as `Range(1e-3, 10, log=True)`: one space, or a

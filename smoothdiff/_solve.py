@@ -12,17 +12,14 @@ from jaxtyping import Array, PyTree
 from tqdm import tqdm
 
 from smoothdiff._black_box import UnknownOutputError
-from smoothdiff._call_checks import (
-    check_call,
-    check_solver,
-    explained,
-)
+from smoothdiff._call_checks import check_call, check_solver, explained
 from smoothdiff._default_solver import default_solver, share_of_range
 from smoothdiff._host_samples import BlackBoxError
 from smoothdiff._host_steps import HostProblem
 from smoothdiff._limits import Limits
+from smoothdiff._problem import Problem
 from smoothdiff._result import Record, Result
-from smoothdiff._run import Problem, Run, inexact
+from smoothdiff._run import Run, inexact
 from smoothdiff._solvers import AbstractSmoothSolver
 from smoothdiff._solvers._base import write_options
 from smoothdiff._solvers._random_numbers import keyed
@@ -139,7 +136,7 @@ def _keeps(asked: bool | None, y: PyTree[Array]) -> bool:
 
 def _begun(problem: Problem, y: PyTree, check: Callable[[PyTree], None]) -> tuple[Problem, Any]:
     """After an evaluation, which counts, if only that can tell what a black box returns."""
-    # what that raises has nothing to do with the error that is caught
+    # the evaluation comes after this, so that what it raises has no other error beside it
     with contextlib.suppress(UnknownOutputError):
         return problem.begin(y, check)
     problem.fun(y, problem.args)

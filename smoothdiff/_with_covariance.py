@@ -86,7 +86,7 @@ def with_covariance(
     before, values, here = answer.evaluations(history)
     points = _around(result, answer, slopes(before, values, here), size)
     if here is None:
-        # the start, or what the history has dropped
+        # the history may have dropped the answer
         points = np.concatenate([answer.vector()[None], points])
     units = answer.units
     unit_fun = units.wrap(fun) if any(units.spaces) else fun

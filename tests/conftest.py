@@ -33,8 +33,12 @@ OPTIMISED = [
     "fuzz",
     "fuzz_runs",
     "gauss_newton",
+    "minimise",
     "numerics",
     "precision",
+    "residual_trust",
+    "returned_point",
+    "scalar_fit",
     "tasks",
     "transforms",
 ]

@@ -3,6 +3,7 @@
 import dataclasses
 import pickle
 import warnings
+from types import SimpleNamespace
 from typing import Any
 
 import equinox as eqx
@@ -15,6 +16,8 @@ from scipy.special import stdtrit
 
 import smoothdiff as sd
 from smoothdiff._covariance import balance, covariance, slopes
+from smoothdiff._solvers._history import History
+from smoothdiff._solvers._point_by_point import PointState
 
 KEY = jax.random.key(0)
 DESIGN = np.float32(np.random.default_rng(9).standard_normal((20, 4)) * [1, 3, 0.1, 1])
@@ -209,6 +212,20 @@ def test_the_search_that_found_the_answer_tells_its_errors():
     here = np.stack(jax.tree.leaves(result.y))
     assert not np.any(np.all(np.asarray(result.state.search.history.points) == here, axis=1))
     np.testing.assert_allclose(result.covariance, expected(tone, result), rtol=0.3, atol=3e-5)
+
+
+def test_of_equal_searches_the_last_has_the_answer():
+    def history(place, lowest):
+        rows, funs = jnp.ones((3, 2)), jnp.array([2.0, lowest, -1])
+        return History(jnp.full((3, 1), place), rows, funs, jnp.array([True, True, False]))
+
+    def place(found, here) -> Any:
+        state: Any = SimpleNamespace(found=found, search=SimpleNamespace(history=here))
+        return PointState.around_lowest(state).points[0, 0]
+
+    assert place(history(1.0, 0), history(2.0, 0)) == 2
+    assert place(history(1.0, 0), history(2.0, 1)) == 1
+    assert place(history(1.0, 1), history(2.0, 0)) == 2
 
 
 def test_an_answer_that_the_history_lost_is_evaluated_again():

@@ -75,18 +75,19 @@ def test_of_two_sides_those_that_fail_come_nearer_together(count):
     np.testing.assert_allclose(first.reach, [1, 0.1])
 
 
-def test_what_runs_beside_first_points_is_new_and_tells_of_no_parameter():
+@pytest.mark.parametrize("count", [4, 8])
+def test_what_runs_beside_first_points_is_new_and_tells_of_no_parameter(count):
     """Along the second parameter alone there are numbers nearby only, and elsewhere everywhere."""
 
     def fun(y):
         alone = (y[0] == 0) & (np.abs(y[1]) > 0.02)
         return np.where(alone, np.nan, np.sum((y - 0.5) ** 2))
 
-    solver = sd.NewtonCG(1.0, num_samples=4, nonfinite="drop")
+    solver = sd.NewtonCG(1.0, num_samples=count, nonfinite="drop")
     search = sd.Search(np.zeros(2, np.float32), key=jax.random.key(0), solver=solver)
     asked = []
     for _ in range(5):
-        points = search.ask(4)
+        points = search.ask(count)
         search.tell(points, [fun(np.asarray(y)) for y in points])
         asked.extend(np.asarray(y).tolist() for y in points)
     along = [abs(y[1]) for y in asked if y[0] == 0 and y[1] != 0]

@@ -454,8 +454,8 @@ def test_a_schedule_for_sigma_is_followed():
 def test_drop_goes_on_without_the_samples_that_fail(sigma):
     settings = DROPPING | {"sigma": sigma}
     result = solve(sieve, (-1.0, 0.0), (0.5, 0.3), max_steps=20, **settings)
-    # no failure ends it; which of the others does is rounding, as the function is 1e-11 there
-    assert result.reason in ("max_steps", "converged", "stalled", "noise")
+    # what ends it is rounding, as the function is 1e-11 there, but no failure
+    assert result.reason not in ("nonfinite", "failed")
     assert distance(result.y, (0.5, 0.3)) < 0.05
     assert all(np.isfinite([record.fun, *record.y]).all() for record in result.history)
 

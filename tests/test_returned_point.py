@@ -344,6 +344,7 @@ def test_a_function_that_fails_at_the_end_costs_nothing_that_was_found(solver):
     assert result.fun == pytest.approx(lowest, rel=1e-6)
     known = zip(HOST.points, HOST.values, strict=True)
     assert any(value == lowest and np.array_equal(result.y, y) for y, value in known)
+    assert not np.array_equal(result.y, START)
 
 
 @pytest.mark.parametrize("solver", quick_of(SETTINGS, ["chunks", "newton", "gauss-newton"]))

@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import optimistix as optx
 import pytest
 from closed_forms import as_users_have_it
@@ -180,9 +181,12 @@ def test_searches_follow_where_they_can_begin_anywhere(bounds, residuals, follow
     assert [solver.restarts > 0 for solver in found] == [False, follow]
 
 
-def test_no_batches_follow_others():
-    many = default_solver(jnp.ones(100), (-3.0, 3.0), None, True, until=True)
-    assert many.restarts == 0
+@pytest.mark.parametrize("residuals", [False, True])
+def test_no_search_follows_one_of_batches(residuals):
+    schedule = optax.linear_schedule(1.0, 0.1, 50)
+    by_schedule = default_solver(jnp.ones(2), (-3.0, 3.0), schedule, residuals, until=True)
+    many = default_solver(jnp.ones(100), (-3.0, 3.0), None, residuals, until=True)
+    assert [getattr(solver, "restarts", 0) for solver in (by_schedule, many)] == [0, 0]
 
 
 @pytest.mark.slow

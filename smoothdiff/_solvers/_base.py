@@ -63,7 +63,7 @@ class Progress(eqx.Module):
         )
 
     def at_start(self) -> Bool[Array, ""]:
-        """Whether nothing was lower than the start."""
+        """Whether the lowest point is the start."""
         same = jax.tree.map(lambda a, b: jnp.all(a == b), self.lowest_y, self.start_y)
         return jnp.all(jnp.stack(jax.tree.leaves(same)))
 

@@ -95,8 +95,8 @@ class History(eqx.Module):
         known = jnp.any(self.valid)
         return jnp.where(known, self.points[i], start), self.rows[i], self.funs[i]
 
-    def is_lower(self, other: "History") -> Bool[Array, ""]:
-        """Whether the lowest value is lower than that of others."""
+    def went_lower(self, other: "History") -> Bool[Array, ""]:
+        """Whether the lowest value is lower than that of another history."""
         return jnp.min(self._known()) < jnp.min(other._known())
 
     def _known(self) -> Float[Array, " M"]:

@@ -66,9 +66,9 @@ def judged(
     Returns:
         The point, and the statistics: `fun`, the function there; `smoothed` and `stderr`, from the
         last batch; and the `evaluations` of the run. A candidate at which the function is not
-        finite loses, unless it was before; of equals the first of the `new` ones wins, as on a
-        plateau an iterate is further from the edges than a sample, but none from a start than
-        which nothing was lower.
+        finite loses; the lowest point keeps the value that it had, if others are finite. Of equals
+        the first of the `new` ones wins, as on a plateau an iterate is further from the edges than
+        a sample. A start that is the lowest point wins over equals.
     """
     if values.takes_key:
         new, old = [*new, *old], []

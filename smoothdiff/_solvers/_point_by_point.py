@@ -46,8 +46,8 @@ class PointState(eqx.Module):
     """The state of a run: `restarts` counts the searches that may still follow.
 
     `aux` is what the function returned beside its value at the iterate, and zeros before it was
-    evaluated there. `found` has the evaluations of the search before, or the one before it, that
-    went lowest: of residuals, for the errors of parameters, where searches may follow.
+    evaluated there. Of the searches that have ended, `found` has the evaluations of the one that
+    went lowest: for the errors of parameters, so of residuals, and where searches may follow.
     """
 
     progress: Progress
@@ -57,9 +57,9 @@ class PointState(eqx.Module):
     aux: PyTree[Array]
 
     def around_lowest(self) -> History:
-        """The evaluations of the search that went lowest."""
-        here = self.search.history
-        return here if self.found is None else where(here.is_lower(self.found), here, self.found)
+        """The evaluations of the search that went lowest, of equals the last, as the answer is."""
+        here, before = self.search.history, self.found
+        return here if before is None else where(before.went_lower(here), before, here)
 
 
 def final_evaluations(candidates: int) -> int:

@@ -270,7 +270,7 @@ class AbstractPointSearch(eqx.Module):
         Below zero for those that run beside first points, which may come several times.
         """
         look = self.look
-        seed = self.round() - jnp.where(self.stage == FIRST, self.evaluated, 0)
+        seed = jnp.where(self.stage == FIRST, -1 - self.evaluated, self.round())
         return seed if look is None else seed + look.seed(self.is_looking())
 
     def is_looking(self) -> Bool[Array, ""]:

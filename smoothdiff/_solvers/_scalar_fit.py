@@ -203,7 +203,7 @@ def fit(
     sides = closeness[:, None] * jnp.stack([jnp.ones_like(targets), targets], axis=1)
 
     def solve(choice: Array) -> tuple[Array, ...]:
-        # a product takes no longer where it is compiled quickly
+        # one product, as sums of entries are slow where little is optimised
         kernel = dot(jnp.append(jnp.ones(1, dtype), choice), parts).reshape(size, size)
         factor = jax.lax.linalg.cholesky(kernel, symmetrize_input=False)
         ones, values = jax.scipy.linalg.solve_triangular(factor, sides, lower=True).T

@@ -219,8 +219,9 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
             return "noise" if state.center.trust.insignificant else "converged"
         if state.search.converged():
             return "converged"
-        search = state.search
-        noise = search.center.trust.insignificant & ~search.plateau(jnp.zeros_like(search.start))
+        history = state.search.history
+        constant = jnp.all(~history.valid | (history.funs == history.best(state.search.start)[2]))
+        noise = state.search.center.trust.insignificant & ~constant
         return "noise" if noise else "stalled"
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):

@@ -150,9 +150,10 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
 
     def __check_init__(self):
         check_settings(self)
-        for name, left_out in ("surrogate_optimizer", ()), ("optimizer", None):
+        for name in ("surrogate_optimizer", "optimizer"):
             optim = getattr(self, name)
-            if optim is not left_out and not isinstance(optim, optax.GradientTransformation):
+            left_out = optim is None and name == "optimizer"
+            if not left_out and not isinstance(optim, optax.GradientTransformation):
                 good = "an optax transformation such as optax.adam(1e-3)"
                 raise TypeError(f"{name} must be {good}: {optim}")
         for name in ("surrogate_steps", "parameter_steps"):

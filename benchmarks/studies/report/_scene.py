@@ -4,9 +4,9 @@ Ours is one rule, and not what came out best: least squares where there are resi
 where parameters act locally, as README advises. It was set before anything was run, and changed
 three times: after results of cnn5, suzanne and mlp were seen, as it named grey_ours and
 local_gradient, and left gauss_newton out where there were more than 300 parameters; when
-local_gauss_newton was written, whose settings had been chosen on suzanne and banana; and where
-newton_cg ends, which was 300 parameters, to that of the shortest call, between which there is no
-scene. Settings of grey_gauss_newton were chosen on cnn5.
+local_gauss_newton was written, whose settings had been chosen on suzanne and banana; and as
+newton_cg had up to 300 parameters, and the shortest call fewer than 100: no scene lies between.
+Settings of grey_gauss_newton were chosen on cnn5.
 """
 
 from collections.abc import Iterator
