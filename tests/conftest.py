@@ -19,8 +19,8 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
-# Programs that are the same in several tests are compiled once a run: the second time, they come
-# from a folder of this run alone. Processes that tests start have it as well.
+# Programs that are the same in several tests are compiled once: the second time, they come from a
+# folder of this run alone, or from one that is given. Processes that tests start have it as well.
 CACHE = {"min_compile_time_secs": "0", "min_entry_size_bytes": "-1"}
 
 # XLA's older, smaller code for fused operations, in one piece, as optimised as any: half the time
@@ -54,8 +54,10 @@ def pytest_configure(config):
     if quick:  # a tenth of the time goes into the lines of code that XLA's programs would name
         jax.config.update("jax_traceback_in_locations_limit", 0)
     if not hasattr(config, "workerinput"):  # workers inherit what the first process has set
-        folder = tempfile.mkdtemp()
-        config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+        folder = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+        if folder is None:
+            folder = tempfile.mkdtemp()
+            config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
         for name, value in CACHE.items():
             os.environ[f"JAX_PERSISTENT_CACHE_{name.upper()}"] = value
         os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
