@@ -70,17 +70,17 @@ def default_solver(
         if any(width is None for width in jax.tree.leaves(sigma, is_leaf=_is_none)):
             # what a space says nothing of
             sigma = jax.tree.map(lambda s, d: d if s is None else s, full, usual, is_leaf=_is_none)
+    # one search by batches takes the evaluations of many point by point
+    by_points = GaussNewton(sigma).sizes(y) is not None
+    restarts = _UNTIL if until and by_points and all_bounded else 0
     if residuals:
         if support is None:
-            by_points = GaussNewton(sigma).sizes(y) is not None
-            restarts = _UNTIL if until and by_points and all_bounded else 0
             return GaussNewton(sigma, restarts=restarts, nonfinite="drop")
         if anywhere and all_bounded and _few_on_a_term(y, support):
             return LocalCrossEntropy(support, nonfinite="drop")
         return LocalGaussNewton(sigma, support, nonfinite="drop")
     # with more parameters a quadratic model takes too many evaluations
     if NewtonCG(1.0).sizes(y) is not None:
-        restarts = _UNTIL if until and all_bounded and not callable(sigma) else 0
         return NewtonCG(sigma, restarts=restarts, nonfinite="drop")
     optim = optax.chain(optax.scale_by_adam(), _in_sigmas(sigma))
     return FirstOrder(optim, sigma, adaptive=not callable(sigma), nonfinite="drop")

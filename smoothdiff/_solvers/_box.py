@@ -1,9 +1,13 @@
-"""The box of parameters that have bounds to both sides."""
+"""The box of parameters that have bounds to both sides, and places in it."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from smoothdiff._params import Params
+
+# without bounds a place is so far away, relative to sigma, as a power of two at random
+_WIDTHS = 2.0
 
 
 def bounded(params: Params) -> bool:
@@ -25,3 +29,17 @@ def bounds_of(params: Params) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
 def closed(params: Params) -> Bool[Array, ""]:
     """Whether all of these bounds are finite."""
     return jnp.all(jnp.isfinite(jnp.stack(bounds_of(params))))
+
+
+def anywhere(params: Params, key: Array, lowest: Float[Array, " n"]) -> Float[Array, " n"]:
+    """A point within the bounds; without them, around the lowest so far at a random width."""
+    key, other = jax.random.split(key)
+    n, dtype = params.theta.size, params.theta.dtype
+    if params.low is not None and params.high is not None:
+        share = jax.random.uniform(key, (n,), dtype)
+        inside = params.low + share * (params.high - params.low)
+    else:
+        inside = jnp.full(n, jnp.inf, dtype)
+    power = jax.random.uniform(other, (), dtype, -_WIDTHS, _WIDTHS)
+    around = lowest + params.sigma * 2.0**power * jax.random.normal(key, (n,), dtype)
+    return params.clip(jnp.where(jnp.isfinite(inside), inside, around))

@@ -21,7 +21,7 @@ from smoothdiff._solvers._base import (
     read_options,
     smoothed_params,
 )
-from smoothdiff._solvers._box import bounded
+from smoothdiff._solvers._box import anywhere, bounded
 from smoothdiff._solvers._evaluator import Evaluator, objectives
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import Values, judged, judging
@@ -38,8 +38,6 @@ PATIENCE = 20
 _PLATEAU = 3
 # of the last evaluations, at least so many, one must be finite where others may be dropped
 _ENOUGH = 10
-# the widths of later searches without bounds, relative to sigma, as powers of two at random
-_WIDTHS = 2.0
 
 
 class PointState(eqx.Module):
@@ -211,7 +209,7 @@ class PointStep(eqx.Module):
         lowest_theta = params.layout.vector(jax.tree.leaves(progress.lowest_y))
         key = jax.random.fold_in(read_options(self.options)[0], progress.evaluations)
         place, other = jax.random.split(key)
-        theta = _anywhere(params, place, lowest_theta)
+        theta = anywhere(params, place, lowest_theta)
         start = params.layout.vector(jax.tree.leaves(progress.start_y))
         lowest_fun = progress.lowest_fun.astype(theta.dtype)
         anew = before.again(params, theta, start, (lowest_theta, lowest_fun), other)
@@ -295,17 +293,3 @@ def _normal_points(solver: Any, key: Array, count: int, like: Float[Array, " n"]
     if log_ratio is not None or not sampler.gaussian:
         raise ValueError(f"{sampler} has weights: {type(solver).__name__} needs normal points")
     return z
-
-
-def _anywhere(params: Params, key: Array, lowest: Array) -> Array:
-    """A point within the bounds; without them, around the lowest so far at a random width."""
-    key, other = jax.random.split(key)
-    n, dtype = params.theta.size, params.theta.dtype
-    if params.low is not None and params.high is not None:
-        share = jax.random.uniform(key, (n,), dtype)
-        inside = params.low + share * (params.high - params.low)
-    else:
-        inside = jnp.full(n, jnp.inf, dtype)
-    power = jax.random.uniform(other, (), dtype, -_WIDTHS, _WIDTHS)
-    around = lowest + params.sigma * 2.0**power * jax.random.normal(key, (n,), dtype)
-    return params.clip(jnp.where(jnp.isfinite(inside), inside, around))
