@@ -154,7 +154,7 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
             optim = getattr(self, name)
             left_out = optim is None and name == "optimizer"
             if not left_out and not isinstance(optim, optax.GradientTransformation):
-                raise TypeError(f"{name} must be a transformation such as optax.adam(1e-3): {optim}")
+                raise TypeError(f"{name} must be one of optax, as optax.adam(1e-3) is: {optim}")
         for name in ("surrogate_steps", "parameter_steps"):
             steps = getattr(self, name)
             if steps is not None and steps < 1:
