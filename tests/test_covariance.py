@@ -201,6 +201,7 @@ def test_jumps_within_the_further_evaluations_are_named():
         assert np.isnan(more.covariance).all()
 
 
+@pytest.mark.slow
 def test_the_search_that_found_the_answer_tells_its_errors():
     tone = lambda y: y["a"] * jnp.sin(y["b"] * times())
     truth = {"a": 2.0, "b": 8.0}
