@@ -3,7 +3,7 @@
 Sigma may suit one parameter and be far too large for another. Where the points along a parameter
 say nothing of the slope at the start, nearer ones take their place, and the parameter has so much
 smaller steps from then on. Sigma may also be nothing for a parameter that begins at zero but for
-rounding: a farther point follows.
+rounding: a later point follows.
 """
 
 import dataclasses
@@ -16,17 +16,20 @@ from jaxtyping import Array, Bool, Float, Int
 # a loss so many times that at the start is far higher; linear residuals that are tried again at the
 # length that is worked out below give at most four times that
 _HIGH = 10.0
-# so often a parameter is tried; at a value that is not finite it comes so much nearer, else at most
-# so much
-_TRIES, NEARER, _NEAREST = 4, 0.1, 1e-6
+# at so many distances a parameter is tried; at a value that is not finite it comes so much nearer,
+# else at most so much
+_DISTANCES, NEARER, _NEAREST = 4, 0.1, 1e-6
+# so often a point that fails is evaluated before one that is nearer: it may have failed by chance,
+# and a step that was made short for that takes many evaluations to grow again
+_CALLS = 2
 
 
 class FirstPoints(eqx.Module):
-    """What is still to be evaluated: `left` counts the tries of the start and of each point.
+    """What is still to be evaluated: `left` counts the calls for the start and for each point.
 
     There are as many points for each parameter, one after the other. `reach` is the length of the
     step along each parameter, in units of its sigma. `before` is the loss at the start, by which
-    `after` tells what is high; with `known` a point has one try.
+    `after` tells what is high; with `known` a point has one call.
     """
 
     reach: Float[Array, " n"]
@@ -36,18 +39,18 @@ class FirstPoints(eqx.Module):
     @staticmethod
     def start(theta: Float[Array, " n"], sides: int = 1) -> "FirstPoints":
         """Nothing has been evaluated; there are so many points for each parameter."""
-        left = jnp.full(sides * len(theta) + 1, _TRIES, jnp.int32)
+        left = jnp.full(sides * len(theta) + 1, _DISTANCES * _CALLS, jnp.int32).at[0].set(_CALLS)
         return FirstPoints(jnp.ones_like(theta), left, jnp.asarray(jnp.inf, theta.dtype))
 
     def around(self, fun: Float[Array, ""]) -> "FirstPoints":
         """All parameters again, from a point with this loss."""
-        left = jnp.full_like(self.left, _TRIES).at[0].set(0)
+        left = jnp.full_like(self.left, _DISTANCES * _CALLS).at[0].set(0)
         return FirstPoints(self.reach, left, fun)
 
     def again(self, which: Bool[Array, " n"], factor: float) -> "FirstPoints":
         """These parameters once more, so many times as far away."""
         points = jnp.repeat(which, (len(self.left) - 1) // len(which))
-        left = jnp.append(jnp.zeros(1, self.left.dtype), points.astype(self.left.dtype))
+        left = _CALLS * jnp.append(False, points).astype(self.left.dtype)
         return FirstPoints(jnp.where(which, factor, 1) * self.reach, left, self.before)
 
     def done(self) -> Bool[Array, ""]:
@@ -92,11 +95,14 @@ class FirstPoints(eqx.Module):
         at, taken = self.next(len(funs))
         start = taken & (at == 0)
         before = jnp.where(jnp.any(start), jnp.min(jnp.where(start, funs, jnp.inf)), self.before)
-        high = ~(funs <= _HIGH * before) & jnp.isfinite(before) & (before > 0) & ~start
-        finite = jnp.isfinite(funs)
+        finite, left = jnp.isfinite(funs), self.left[at]
+        again = ~finite & (left % _CALLS != 1)
+        # if the start failed too, nearer is no better
+        high = ~(funs <= _HIGH * before) & jnp.isfinite(before) & (before > 0) & ~start & ~again
+        later = jnp.where(high, (left - 1) // _CALLS * _CALLS, 0)
+        tries = jnp.where(again, left - 1, later)
         nearer = jnp.sqrt(before / jnp.where(finite & high, funs, 1))
         nearer = jnp.where(finite, jnp.maximum(nearer, _NEAREST), NEARER)
-        tries = jnp.where(high, self.left[at] - 1, 0)
         nearer = jnp.where(high & (tries > 0), nearer, 1)
         left = self.left.at[jnp.where(taken, at, len(self.left))].set(tries, mode="drop")
         along = jnp.where(taken & (at > 0), at - 1, len(self.reach))

@@ -41,7 +41,8 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
 
     - **The first points** are the start, and one sigma from it along each parameter. Where the loss
       is more than ten times as high there, a nearer point follows, and the width of that parameter
-      shrinks as much. Where the residuals hardly change, and sigma is below a thousandth of the
+      shrinks as much. A point that fails is evaluated once more, in case that was chance, before a
+      nearer one. Where the residuals hardly change, and sigma is below a thousandth of the
       largest, as for a parameter that is zero but for rounding, a farther one follows. If all
       residuals hardly differ, pairs of points follow, each four times as far away, up to a thousand
       sigma. Where these find a change, the first points are taken again.
