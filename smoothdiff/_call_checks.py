@@ -2,13 +2,15 @@
 
 import contextlib
 import inspect
+import math
 from collections.abc import Iterator
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
-from jaxtyping import PyTree
+from jaxtyping import Float, PyTree
 
 from smoothdiff._solvers import AbstractSmoothSolver
 from smoothdiff._solvers._wrapped import wraps_ours
@@ -90,6 +92,26 @@ def check_residuals(out: PyTree) -> None:
         raise TypeError(
             f"fun returned {out}; it must return residuals, real floating-point arrays: "
             "use .astype(float)"
+        )
+
+
+def check_squares(row: Float[np.ndarray, " P"]) -> None:
+    """Raises ValueError if squares of the first residuals are too small to be compared.
+
+    Below the smallest number over its rounding, half their sum would be nothing before it is as low
+    as rounding lets it be, and a run would end there as if it had converged.
+    """
+    largest, info = float(np.max(np.abs(row), initial=0)), np.finfo(row.dtype)
+    if not (np.isfinite(largest) and largest > 0):
+        return
+    least = math.sqrt(2 * float(info.tiny) / float(info.eps))
+    length = largest * float(np.linalg.norm(row / row.dtype.type(largest)))
+    if length < least:
+        other = "" if info.bits == 64 else ", or use float64"
+        factor = 10.0 ** -math.floor(math.log10(largest))
+        raise ValueError(
+            f"the first residuals are at most {largest:.2g}, and squares of such numbers are too "
+            f"small for {row.dtype}: return them times {factor:.0e}, for example{other}"
         )
 
 

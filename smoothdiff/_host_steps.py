@@ -12,8 +12,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
+from smoothdiff._call_checks import check_squares
 from smoothdiff._flat import Flat
 from smoothdiff._host_function import evaluator, rows_at, traced
 from smoothdiff._problem import Problem, Trial
@@ -61,6 +63,8 @@ class HostProblem(Problem):
         if takes_key(self.options):
             args = self.host.parts(y, state).numbers(args)
         rows = rows_at(_evaluator(self, args, y), points, len(points), self.quick)
+        if self.solver.squares and state.progress.step == 0:
+            check_squares(np.asarray(rows[0]))
         return self.host.told(y, state, points, rows, proposal)
 
     def done(self, y: PyTree, state: PointState) -> Bool[Array, ""]:

@@ -35,6 +35,10 @@ _ADVICE = {
     "drop": 'Too few samples were finite for nonfinite="drop" to go on with the others: begin '
     "where fun is finite, take a smaller sigma, or set bounds within which it is",
 }
+_OVERFLOW = (
+    ". Residuals count as infinite if half the sum of their squares is: then scale them, or use "
+    "float64"
+)
 _UNBOUNDED = (
     "\nNothing bounds the search: bounds=(low, high), or a space, keeps it to points where fun can "
     "be evaluated"
@@ -125,7 +129,7 @@ class Run:
         """The function, or half the sum of squares of residuals."""
         with reraise():
             leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(self.problem.value(y))]
-        if isinstance(self._ours(), optx.AbstractLeastSquaresSolver):
+        if self._is_of_residuals():
             return float(sum(np.sum(leaf * leaf) for leaf in leaves)) / 2
         return float(leaves[0])
 
@@ -191,8 +195,12 @@ class Run:
         solver = self.problem.solver
         return solver.ours() if isinstance(solver, Wrapped) else solver
 
+    def _is_of_residuals(self) -> bool:
+        return isinstance(self._ours(), optx.AbstractLeastSquaresSolver)
+
     def _nonfinite(self, progress: Progress | None = None) -> MinimiseError:
         advice = _ADVICE[getattr(self._ours(), "nonfinite", "propagate")]
+        advice += _OVERFLOW if self._is_of_residuals() else ""
         return MinimiseError(_NONFINITE + advice, self.found("nonfinite", progress))
 
     def failed(self, error: Exception) -> MinimiseError:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from smoothdiff._call_checks import check_squares
 from smoothdiff._default_solver import default_solver, share_of_range
 from smoothdiff._host_steps import HostSteps
 from smoothdiff._layout import layout_of
@@ -244,6 +245,8 @@ class Search:
         leaves = [np.ravel(np.asarray(leaf)) for leaf in jax.tree.leaves(value)]
         row = np.concatenate(leaves).astype(self._layout.dtype)
         if self._size is None and not (row.size == 1 and np.isnan(row[0])):
+            if self.solver.squares:
+                check_squares(row)
             self._size = row.size
             self._state = self._first(row.size) if row.size > 1 else self._state
         if row.size == 1 and np.isnan(row[0]):

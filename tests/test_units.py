@@ -51,6 +51,19 @@ def test_a_parameter_with_a_range_has_a_share_of_that():
     np.testing.assert_allclose(solver.sigma, [2.0, 10.0], rtol=1e-6)
 
 
+def test_residuals_whose_squares_are_no_numbers_are_an_error():
+    """At 1e-20 every loss is zero, and a run would have converged at its start; at 1e20 none is."""
+    scaled = lambda scale: lambda y: scale * (decay(y) - decay(FOUND))
+    for scale in (1e-17, 1e-30):
+        with pytest.raises(ValueError, match=r"too small for float32: return them times 1e\+"):
+            solved(sd.least_squares, scaled(scale), UNITS)
+    with pytest.raises(sd.MinimiseError, match="half the sum of their squares"):
+        solved(sd.least_squares, scaled(1e20), UNITS)
+    search = sd.Search(UNITS, key=jax.random.key(0), residuals=True)
+    with pytest.raises(ValueError, match="use float64"):
+        search.tell(search.ask(), [scaled(1e-20)(UNITS)])
+
+
 @calls
 def test_one_array_may_hold_very_different_units(call):
     residuals = lambda y: decay(y) - decay(FOUND)
