@@ -33,9 +33,11 @@ class Search:
 
     Points may be told in any order. Some may be missing, or have failed with a NaN. More may be
     asked for before all are told, so no worker waits for the slowest. Values at points that were
-    never asked for teach as well, so earlier evaluations can be told at the beginning. To save a
-    search, keep its points and values: a new search with the same key that is told the same values
-    in the same calls, with none still out, goes on where the old one was.
+    never asked for teach as well, so earlier evaluations can be told at the beginning.
+
+    To save a search, pickle it: it goes on where it was, with the same version of smoothdiff. For
+    other versions keep its points and values. A new search with the same key that is told the same
+    values in the same calls, with none still out, goes on where the old one was.
 
     `ask` gives what the model wants next. If that is still out, further points follow: in the local
     model shorter and longer steps, in a round of samples its next ones. A point that nobody tells
@@ -82,13 +84,11 @@ class Search:
         bounds: tuple[PyTree, PyTree] | None = None,
         takes_key: bool = False,
     ):
-        self._natural, unit = (lambda y: y), lambda y: y
-        if space is not None:
-            units = UnitSpace.of(y0, space)
-            self._natural, unit, bounds = units.natural, units.unit, units.bounds()
+        self._units = None if space is None else UnitSpace.of(y0, space)
+        if (units := self._units) is not None:
+            bounds = units.bounds()
             if solver is None and sigma is None:
                 sigma = units.sigma(share_of_range(units.unit(y0), residuals))
-        self._unit = lambda y: jax.tree.map(inexact, unit(y))
         self._y = self._unit(y0)
         if solver is None:
             solver = default_solver(self._y, bounds, sigma, residuals)
@@ -237,6 +237,12 @@ class Search:
     def _clipped(self, vector: np.ndarray) -> np.ndarray:
         params = self._steps.parts(self._y, self._state).params()
         return np.asarray(params.clip(jnp.asarray(vector, params.theta.dtype)))
+
+    def _natural(self, y: PyTree) -> PyTree:
+        return y if self._units is None else self._units.natural(y)
+
+    def _unit(self, y: PyTree) -> PyTree[Array]:
+        return jax.tree.map(inexact, y if self._units is None else self._units.unit(y))
 
     def _vector(self, point: PyTree) -> np.ndarray:
         return np.asarray(self._layout.vector(jax.tree.leaves(self._unit(point))))

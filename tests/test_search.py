@@ -1,5 +1,7 @@
 """Asking and telling: the steps of the solvers, in any order, with points missing or failed."""
 
+import pickle
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -63,6 +65,22 @@ def test_points_come_in_any_order_or_never_or_fail(workers):
             search.tell([point], [valley(point) if fate > 0.2 else np.nan])
     assert search.fun <= 1e-4
     assert search.fun == pytest.approx(0.5 * squares(search.y))
+
+
+def test_a_search_that_was_pickled_goes_on_as_if_it_was_not():
+    """With one point out, and one told before its turn."""
+    search = sd.Search(START, key=KEY, residuals=True, sigma=0.3)
+    _, second = search.ask(2)
+    search.tell([second], [valley(second)])
+    again = pickle.loads(pickle.dumps(search))
+    for _ in range(3):
+        (point,), (same,) = search.ask(), again.ask()
+        np.testing.assert_array_equal(point, same)
+        for each in (search, again):
+            each.tell([point], [valley(point)])
+    assert (search.fun, search.evaluations) == (again.fun, 4) == (again.fun, again.evaluations)
+    within = sd.Search(START, key=KEY, residuals=True, space=sd.Range(-3, 3))
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(within)).y, within.y)
 
 
 def test_what_is_asked_for_is_new():
