@@ -23,6 +23,19 @@ _HOST = (
 )
 
 
+def check_start(y0: PyTree) -> None:
+    """Raises ValueError if a number of the start is NaN or infinite."""
+    for path, leaf in jax.tree_util.tree_flatten_with_path(y0)[0]:
+        if jnp.issubdtype(getattr(leaf, "dtype", type(leaf)), jnp.inexact):
+            numbers = np.asarray(leaf)
+            for at in np.argwhere(~np.isfinite(numbers))[:1]:
+                entry = f"[{', '.join(map(str, at))}]" if len(at) else ""
+                raise ValueError(
+                    f"y0{jax.tree_util.keystr(path)}{entry} = {numbers[tuple(at)]} is not finite: "
+                    "give a start at finite numbers"
+                )
+
+
 def check_call(fun: Any, y0: Any, bounds: Any, space: Any, takes_key: bool = False) -> None:
     """Raises TypeError or ValueError for arguments in another order or of another library."""
     solvers = AbstractSmoothSolver | optx.AbstractIterativeSolver
@@ -33,6 +46,7 @@ def check_call(fun: Any, y0: Any, bounds: Any, space: Any, takes_key: bool = Fal
         )
     if not callable(fun):
         raise TypeError(f"fun must be a function of (y, args), not {type(fun).__name__}")
+    check_start(y0)
     with contextlib.suppress(ValueError):  # some builtins have no signature
         try:
             inspect.signature(fun).bind(*((y0, None, None) if takes_key else (y0, None)))

@@ -162,7 +162,7 @@ def least_squares(
     Args:
         fun: the residuals, `fun(y, args)`, an array or a pytree of arrays. May contain a black box.
             Their squares are summed: in float32 they should be between 1e-15 and 1e18.
-        y0: where to start, a pytree of numbers and arrays.
+        y0: where to start, a pytree of finite numbers and arrays.
         args: passed on to `fun`.
         key: a random key; the same key gives the same run.
         solver: how to step, by default `GaussNewton(sigma)`. With a `support` the default is

@@ -594,6 +594,12 @@ def test_a_file_that_is_no_checkpoint_is_refused(content, tmp_path):
         ({"key": None}, ValueError, r"jax\.random\.key\(0\)"),
         ({"fun": lambda y, args: y}, TypeError, "one real floating-point number"),
         ({"fun": lambda y, args: jnp.argmax(y)}, TypeError, "one real floating-point number"),
+        (
+            {"y0": {"a": 1.0, "b": np.array([[1, np.nan]])}},
+            ValueError,
+            r"y0\['b'\]\[0, 1\] = nan is",
+        ),
+        ({"y0": -np.inf}, ValueError, "y0 = -inf is not finite"),
         ({"bounds": (1.0, 2.0)}, ValueError, "outside its bounds"),
         ({"bounds": (1.0, -1.0)}, ValueError, "above"),
         ({"solver": sd.FirstOrder(optax.sgd(0.1), -0.1)}, ValueError, "positive"),
