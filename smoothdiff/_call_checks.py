@@ -89,14 +89,18 @@ def check_solver(solver: Any, kind: type, example: str, sigma: Any, support: Any
         )
 
 
+def returned(out: PyTree) -> str:
+    """What the function returned, in words."""
+    shapes, dtypes = jax.tree.map(lambda a: a.shape, out), jax.tree.map(lambda a: str(a.dtype), out)
+    return f"fun returned shape {shapes} and dtype {dtypes}"
+
+
 def check_number(out: PyTree) -> None:
     leaves = jax.tree.leaves(out)
     if [leaf.shape for leaf in leaves] != [()] or not jnp.issubdtype(leaves[0].dtype, jnp.floating):
-        shapes, dtypes = jax.tree.map(lambda a: a.shape, out), jax.tree.map(lambda a: a.dtype, out)
         raise TypeError(
-            f"fun returned shape {shapes} and dtype {dtypes}; it must return one real "
-            "floating-point number: use jnp.mean(...) or .astype(float), or give residuals to "
-            "sd.least_squares"
+            f"{returned(out)}; it must return one real number: use jnp.mean(...) or "
+            ".astype(float), or give residuals to sd.least_squares"
         )
 
 
@@ -104,7 +108,7 @@ def check_residuals(out: PyTree) -> None:
     leaves = jax.tree.leaves(out)
     if not leaves or not all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves):
         raise TypeError(
-            f"fun returned {out}; it must return residuals, real floating-point arrays: "
+            f"{returned(out)}; it must return residuals, real floating-point arrays: "
             "use .astype(float)"
         )
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PyTree
 
 from smoothdiff._layout import layout_of
 from smoothdiff._programs import QUICKLY
-from smoothdiff._solvers._evaluator import Evaluator
+from smoothdiff._solvers._evaluator import Evaluator, called
 
 
 class _Function(eqx.Module):
@@ -21,7 +21,7 @@ class _Function(eqx.Module):
     fun: Callable[[PyTree, PyTree], Any]
 
     def __call__(self, y: PyTree, args: PyTree) -> tuple[PyTree[Array], None]:
-        return jax.tree.map(jnp.asarray, self.fun(y, args)), None
+        return called(self.fun, y, args), None
 
 
 def evaluator(

@@ -61,8 +61,9 @@ def minimise(
     Ctrl-C ends the run, without a further evaluation, and returns what has been found.
 
     Args:
-        fun: the function, `fun(y, args)`, which returns one number. May contain a black box.
-        y0: where to start, a pytree of numbers and arrays.
+        fun: the function, `fun(y, args)`, which returns one number; a whole one, such as a count,
+            becomes a float. May contain a black box.
+        y0: where to start, a pytree of finite numbers and arrays.
         args: passed on to `fun`.
         key: a random key; the same key gives the same run.
         solver: how to step, such as `NewtonCG(sigma)` or `FirstOrder(optax.adam(0.1), sigma)`, or

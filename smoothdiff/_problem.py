@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree
 
+from smoothdiff._solvers._evaluator import called
+
 
 class Trial(NamedTuple):
     """The function at the lowest point once more, and whether it is another value."""
@@ -26,7 +28,7 @@ class Problem(eqx.Module):
     options: dict[str, Any]
 
     def _fn(self, y: PyTree, args: PyTree) -> tuple[PyTree[Array], None]:
-        return jax.tree.map(jnp.asarray, self.fun(y, args)), None
+        return called(self.fun, y, args), None
 
     @eqx.filter_jit
     def value(self, y: PyTree) -> PyTree[Array]:

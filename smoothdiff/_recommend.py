@@ -20,6 +20,7 @@ from smoothdiff._params import as_key, take_apart
 from smoothdiff._reraise import reraise
 from smoothdiff._run import inexact
 from smoothdiff._solvers._base import write_options
+from smoothdiff._solvers._evaluator import called
 from smoothdiff._solvers._random_numbers import in_step, keyed
 from smoothdiff._unit_space import UnitSpace
 
@@ -186,7 +187,7 @@ def recommend(
 
 def _residuals(fun: Callable, y: PyTree, args: PyTree) -> tuple[bool, int]:
     """Whether the function returns residuals, and how many evaluations it took to know."""
-    spent, shapes = 0, lambda: jax.eval_shape(lambda y: jax.tree.map(jnp.asarray, fun(y, args)), y)
+    spent, shapes = 0, lambda: jax.eval_shape(lambda y: called(fun, y, args), y)
     with explained():
         try:
             out = shapes()

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from smoothdiff._call_checks import returned
 from smoothdiff._params import Params, take_apart
 from smoothdiff._ranges import Integer
 from smoothdiff._samplers import Sobol
@@ -88,7 +89,7 @@ class Slices:
         out = jax.eval_shape(lambda u: jax.tree.map(jnp.asarray, wrapped(u, args)), start)
         if [leaf.shape for leaf in jax.tree.leaves(out)] != [()]:
             raise TypeError(
-                f"fun returned {out}; it must return one number: for residuals, give "
+                f"{returned(out)}; it must return one number: for residuals, give "
                 "lambda y, args: jnp.sum(residuals(y, args) ** 2) / 2"
             )
         params = take_apart(start, sigma, bounds)

@@ -592,8 +592,8 @@ def test_a_file_that_is_no_checkpoint_is_refused(content, tmp_path):
         ({"solver": optx.BFGS(1e-3, 1e-3)}, TypeError, "such as NewtonCG"),
         ({"key": 0}, TypeError, r"jax\.random\.key\(0\)"),
         ({"key": None}, ValueError, r"jax\.random\.key\(0\)"),
-        ({"fun": lambda y, args: y}, TypeError, "one real floating-point number"),
-        ({"fun": lambda y, args: jnp.argmax(y)}, TypeError, "one real floating-point number"),
+        ({"fun": lambda y, args: y}, TypeError, "one real number"),
+        ({"fun": lambda y, args: jnp.any(y > 0)}, TypeError, "one real number"),
         (
             {"y0": {"a": 1.0, "b": np.array([[1, np.nan]])}},
             ValueError,
@@ -611,6 +611,13 @@ def test_bad_input_is_refused_before_any_evaluation(change, error, match, host):
     with pytest.raises(error, match=match):
         sd.minimise(**call)
     assert host.count == 0
+
+
+@pytest.mark.parametrize("solver", [None, ADAM], ids=["points", "batches"])
+def test_a_count_is_a_loss_like_any_other(solver):
+    count = lambda y, args: jnp.sum(jnp.abs(y[None] - 0.5) > jnp.arange(8)[:, None] / 16)
+    result = sd.minimise(count, Y0, key=KEY, solver=solver, max_steps=3)
+    assert result.fun == int(count(result.y, None)) < int(count(Y0, None))
 
 
 def test_the_bar_shows_only_when_asked_for(capsys):

@@ -269,7 +269,8 @@ def test_what_a_slice_refuses(error, message, options):
 
 def test_a_slice_of_no_number_or_of_too_many():
     key = jax.random.key(0)
-    with pytest.raises(TypeError, match="must return one number"):
+    words = r"fun returned shape \(2,\) and dtype float32; it must return one number"
+    with pytest.raises(TypeError, match=words):
         sd.plot.slice(lambda y, args: y, jnp.ones(2), sigma=0.1, key=key)
     with pytest.raises(ValueError, match="too many for one figure"):
         sd.plot.slice(lambda y, args: jnp.sum(y), jnp.ones(99), sigma=0.1, key=key)

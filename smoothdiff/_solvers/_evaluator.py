@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.sharding import NamedSharding
 from jaxtyping import Array, Float, PyTree
 
-from smoothdiff._layout import Layout
+from smoothdiff._layout import Layout, layout_of
 from smoothdiff._sharding import columns_shared_out, shared_out
 
 
@@ -56,6 +56,18 @@ class Evaluator(eqx.Module):
         vector = self.layout.vector
         rows, _ = self(jax.vmap(lambda y: vector(jax.tree.leaves(y)))(points))
         return self.funs(rows)
+
+
+def called(fun: Callable[[PyTree, Any], Any], y: PyTree[Array], args: PyTree) -> PyTree[Array]:
+    """What the user's function returns, as arrays; a single whole number as a float, as in `y`.
+
+    A count is a loss as good as any. Arrays of whole numbers are not: their differences may wrap.
+    """
+    out = jax.tree.map(jnp.asarray, fun(y, args))
+    leaves = jax.tree.leaves(out)
+    if [leaf.shape for leaf in leaves] != [()] or not jnp.issubdtype(leaves[0].dtype, jnp.integer):
+        return out
+    return jax.tree.map(lambda a: a.astype(layout_of(y).dtype), out)
 
 
 def objectives(rows: Float[Array, "m P"], squares: bool) -> Float[Array, " m"]:
