@@ -3,7 +3,7 @@
 Sigma may suit one parameter and be far too large for another. Where the points along a parameter
 say nothing of the slope at the start, nearer ones take their place, and the parameter has so much
 smaller steps from then on. Sigma may also be nothing for a parameter that begins at zero but for
-rounding: a later point follows.
+rounding: a farther point follows.
 """
 
 import dataclasses
@@ -96,6 +96,7 @@ class FirstPoints(eqx.Module):
         start = taken & (at == 0)
         before = jnp.where(jnp.any(start), jnp.min(jnp.where(start, funs, jnp.inf)), self.before)
         finite, left = jnp.isfinite(funs), self.left[at]
+        # `left` counts down through the calls at each distance: the last of these leaves a 1
         again = ~finite & (left % _CALLS != 1)
         # if the start failed too, nearer is no better
         high = ~(funs <= _HIGH * before) & jnp.isfinite(before) & (before > 0) & ~start & ~again
