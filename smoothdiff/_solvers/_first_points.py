@@ -19,6 +19,8 @@ _HIGH = 10.0
 # at so many distances a parameter is tried; at a value that is not finite it comes so much nearer,
 # else at most so much
 _DISTANCES, NEARER, _NEAREST = 4, 0.1, 1e-6
+# where points are nothing beside others they are tried so many times farther
+FARTHER = 100.0
 # so often a point that fails is evaluated before one that is nearer: it may have failed by chance,
 # and a step that was made short for that takes many evaluations to grow again
 _CALLS = 2
@@ -47,8 +49,8 @@ class FirstPoints(eqx.Module):
         left = jnp.full_like(self.left, _DISTANCES * _CALLS).at[0].set(0)
         return FirstPoints(self.reach, left, fun)
 
-    def again(self, which: Bool[Array, " n"], factor: float) -> "FirstPoints":
-        """These parameters once more, so many times as far away."""
+    def again(self, which: Bool[Array, " n"], factor: float | Array) -> "FirstPoints":
+        """These parameters once more, so many times as far away, all or each."""
         points = jnp.repeat(which, (len(self.left) - 1) // len(which))
         left = _CALLS * jnp.append(False, points).astype(self.left.dtype)
         return FirstPoints(jnp.where(which, factor, 1) * self.reach, left, self.before)

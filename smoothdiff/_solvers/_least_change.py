@@ -4,7 +4,18 @@ $$ \min_{g, H} \|H - H_0\|_F, \qquad g \cdot a_i + \tfrac12 a_i \cdot H a_i = f_
 
 So 2 n + 1 evaluations are enough to begin with; (n + 1)(n + 2) / 2 determine a quadratic.
 
-Source: Powell 2004 (NEWUOA, BOBYQA); the errors of points that are high are our own.
+A function that is none has points that contradict each other: interpolated, those along a line give
+a Hessian that is far too large. Read as the mean of a Gaussian process, whose Hessian varies around
+the last one, the model has an evidence. Where that is clearly higher with a remainder that grows
+with the distance, the points need not be met exactly, the far ones least:
+
+$$ -\tfrac12 (m - n - 1) \log r \cdot w - \tfrac12 \log |\det S| $$
+
+for m points, whose values less the last Hessian's are r; S is the system of equations, and w are
+the weights of the points that solve it.
+
+Source: Powell 2004 (NEWUOA, BOBYQA); Rasmussen and Williams 2006, section 2.7, for the evidence;
+the errors of points that are high and of those that are far are our own.
 """
 
 from typing import NamedTuple
@@ -25,6 +36,16 @@ _FARTHEST = 3.0
 _HIGH, _HIGHEST = 3.0, 1e6
 # the errors of the others, against the squared distances
 _RIDGE = {"float32": 1e-7, "float64": 1e-12}
+# what is left of a function that is no quadratic grows as the third power of the distance: this is
+# its variance, against that of the Hessian's entries, where the kernel is about 1
+_REMAINDER = 1e-4
+# the logarithm of the evidence from which on a function is none
+_CLEARLY = 2.0
+
+
+def determined_by(n: int) -> int:
+    """So many evaluations determine a quadratic."""
+    return (n + 1) * (n + 2) // 2
 
 
 class Quadratic(NamedTuple):
@@ -71,8 +92,8 @@ def least_change(
     again = history.valid & (length == 0) & (history.funs == fun)
     again &= jnp.arange(len(away)) != jnp.argmax(again)
     everywhere = jnp.where(history.valid & ~again, length, jnp.inf)
-    count = max(min((n + 1) * (n + 2) // 2, _MOST), 2 * n + 1)
-    nearest, near = jax.lax.top_k(-jnp.asarray(everywhere), min(count, len(away)))
+    most = max(min(determined_by(n), _MOST), 2 * n + 1)
+    nearest, near = jax.lax.top_k(-jnp.asarray(everywhere), min(most, len(away)))
     distance = -jnp.asarray(nearest)
     close = distance[: 2 * n + 1]
     spread = jnp.max(jnp.where(jnp.isfinite(close), close, 0))
@@ -88,29 +109,40 @@ def least_change(
     rise = jnp.minimum(rise, _HIGHEST * high)
 
     old = before * width**2
-    error = jnp.where(used, _RIDGE[dtype.name] * above**2, 1)
     borders = jnp.concatenate([used[:, None].astype(dtype), a], axis=1)
     corner = -jnp.finfo(dtype).eps * jnp.eye(n + 1, dtype=dtype)
-    kernel = dot(a, a.T) ** 2 / 2 + jnp.diag(error)
-    system = jnp.block([[kernel, borders], [borders.T, corner]])
+    bends, sixth = dot(a, a.T) ** 2 / 2, jnp.sum(a * a, axis=1) ** 3
     farthest = jnp.argmax(jnp.where(used, distance, -1))
     left = rise - jnp.sum(dot(a, old) * a, axis=1) / 2
     sides = jnp.stack([jnp.where(used, left, 0), jnp.eye(len(a), dtype=dtype)[farthest]])
     sides = jnp.pad(sides, ((0, 0), (0, n + 1)))
-    factor = jax.scipy.linalg.lu_factor(system)
-    solved = jax.scipy.linalg.lu_solve(factor, sides.T)
-    # once more for what rounding left, which is much in float32
-    solved += jax.scipy.linalg.lu_solve(factor, sides.T - dot(system, solved))
-    solved = solved.T
-    solved = jnp.asarray(jnp.where(jnp.all(jnp.isfinite(solved)), solved, 0))
-    bends = [dot(a.T * weights[None], a) for weights in solved[:, : len(a)]]
+    count = jnp.sum(used)
+
+    def solution(remainder: Array) -> tuple[Array, Array]:
+        """Weights of the points, constants and slopes, and the evidence for such a remainder."""
+        error = jnp.where(used, (_RIDGE[dtype.name] + remainder * sixth) * above**2, 1)
+        system = jnp.block([[bends + jnp.diag(error), borders], [borders.T, corner]])
+        factor = jax.scipy.linalg.lu_factor(system)
+        solved = jax.scipy.linalg.lu_solve(factor, sides.T)
+        # once more for what rounding left, which is much in float32
+        solved += jax.scipy.linalg.lu_solve(factor, sides.T - dot(system, solved))
+        changes = jnp.maximum(dot(sides[0], solved[:, 0]), tiny)
+        free = jnp.maximum(count - (n + 1), 1).astype(dtype)
+        volume = jnp.sum(jnp.log(jnp.abs(jnp.diagonal(factor[0]))))
+        finite = jnp.all(jnp.isfinite(solved))
+        evidence = -(free * jnp.log(changes) + volume) / 2
+        return jnp.where(finite, solved.T, 0), jnp.where(finite, evidence, -jnp.inf)
+
+    solutions, evidence = jax.vmap(solution)(jnp.asarray([0, _REMAINDER], dtype))
+    solved = solutions[(evidence[1] > evidence[0] + _CLEARLY).astype(jnp.int32)]
+    bent = [dot(a.T * weights[None], a) for weights in solved[:, : len(a)]]
     constants, slopes = solved[:, len(a)], solved[:, len(a) + 1 :] / width
     return Quadratic(
         grad=slopes[0],
-        hessian=(old + bends[0]) / width**2,
-        polynomial=(constants[1], slopes[1], bends[1] / width**2),
+        hessian=(old + bent[0]) / width**2,
+        polynomial=(constants[1], slopes[1], bent[1] / width**2),
         farthest=distance[farthest],
-        used=jnp.sum(used),
+        used=count,
         highest=highest,
         away=jnp.where(used[:, None], away[near], 0),
     )

@@ -23,6 +23,8 @@ from smoothdiff._solvers._stages import FIRST, LOOK, PILOT, TRUST, Sizes, where
 _SMALL = 3
 # so many times as many evaluations may fail if samples come nearer to where the function is finite
 _COMING = 4
+# a step is nothing beside others below this share of the largest sigma
+_BESIDE = 1e-3
 # a width of so many roundings of sigma is nothing
 _NOTHING = 32
 
@@ -209,6 +211,14 @@ class AbstractPointSearch(eqx.Module):
         point, _, fun = self.history.best(self.start)
         away = jnp.any(jnp.abs(self.history.points - point[None]) > reach[None], axis=1)
         return jnp.any(self.history.valid & (self.history.funs == fun) & away)
+
+    def too_near(self, params: Params) -> Bool[Array, " n"]:
+        """Parameters whose first points change hardly anything, and are nothing beside others."""
+        history = self.history
+        alone, here = history.alone(self.start)
+        level = hardly_differ(history.rows, history.rows[here])[:, None]
+        flat = jnp.any(alone & level, axis=0) & ~jnp.any(alone & ~level, axis=0)
+        return flat & (self.first.reach * params.sigma < _BESIDE * jnp.max(params.sigma))
 
     def piloting(self) -> Any:
         """With the pilot next, if the first points are over and all evaluations hardly differ."""

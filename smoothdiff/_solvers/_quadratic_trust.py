@@ -2,7 +2,9 @@ r"""Newton steps within a trust region, one evaluation a step: while a quadratic
 
 Around the best point the function is modelled as $f + g \cdot u + \tfrac12 u \cdot H u$, in the
 coordinates u in which the Hessian is round, as far as it is known: a narrow valley is as easy as a
-bowl. After a short step comes a point that checks the model, see there.
+bowl. They follow the Hessian of a model that has just predicted, or whose points determine it: of
+fewer a Hessian is a guess, and widths that follow a guess make the next one worse. After a short
+step comes a point that checks the model, see there.
 
 Source: the metric is our own.
 """
@@ -19,7 +21,7 @@ from smoothdiff._products import dot
 from smoothdiff._solvers._base import all_finite
 from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._history import History
-from smoothdiff._solvers._least_change import least_change
+from smoothdiff._solvers._least_change import determined_by, least_change
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._model_check import check_step, is_right
 from smoothdiff._solvers._point_search import nothing, powers_of_two
@@ -36,7 +38,8 @@ class Proposal(NamedTuple):
     """Steps to evaluate, in units of the metric, and what the model says of them.
 
     The first may be a `check` that the function rises there as predicted. The radius is `tight`
-    where the model promises no more within it than rounding may take, but may beyond.
+    where the model promises no more within it than rounding may take, but may beyond. The Hessian
+    is `determined` by as many points as it takes.
     """
 
     steps: Float[Array, "K n"]
@@ -46,6 +49,7 @@ class Proposal(NamedTuple):
     check: Bool[Array, ""]
     rise: Float[Array, ""]
     tight: Bool[Array, ""]
+    determined: Bool[Array, ""]
 
 
 class QuadraticTrust(eqx.Module):
@@ -86,6 +90,7 @@ class QuadraticTrust(eqx.Module):
             check=no,
             rise=zeros(),
             tight=no,
+            determined=no,
         )
 
     def failed(self) -> Bool[Array, ""]:
@@ -157,7 +162,8 @@ class QuadraticTrust(eqx.Module):
         steps = steps.at[0].set(first)
         reduction = reduction.at[0].set(jnp.where(which > 0, 0, reduction[0]))
         poor = (model.farthest > _FAR * self.radius) & (model.used > len(center) + 1)
-        return Proposal(steps, reduction, hessian, poor, check, rise, asked.tight)
+        determined = model.used >= determined_by(len(center))
+        return Proposal(steps, reduction, hessian, poor, check, rise, asked.tight, determined)
 
     def _within_bounds(
         self, hessian: Array, grad: Array, radius: Array, center: Array, params: Params
@@ -180,7 +186,7 @@ class QuadraticTrust(eqx.Module):
         funs: Float[Array, " K"],
         good: Bool[Array, " K"],
     ) -> "QuadraticTrust":
-        """The region after these values came; its metric is that of the last Hessian."""
+        """The region after these values came; its metric follows a Hessian that can be trusted."""
         funs = jnp.where(good, funs, jnp.inf)
         best = jnp.argmin(funs)
         fun, reduction = funs[best], proposal.reduction[best]
@@ -188,14 +194,16 @@ class QuadraticTrust(eqx.Module):
         metric, turn = self.metric.adapted(
             lambda v: dot(hessian, v), jnp.diagonal(hessian), jnp.zeros_like(fun)
         )
-        usable = all_finite((metric, turn))
+        outcome = ratio_test(before, fun, reduction, self.fails)
+        _, failed, held, long, fails, _ = outcome
+        # a check is no step, but a model that is right about it may have converged
+        right = proposal.check & is_right(before, funs[0], proposal.rise)
+        usable = all_finite((metric, turn)) & (held | right | proposal.tight | proposal.determined)
         still = Metric.of(jnp.ones_like(proposal.steps[0]), True)
         metric, turn = jax.tree.map(
             lambda a, b: jnp.where(usable, a, b), (metric, turn), (self.metric, still)
         )
         length = jnp.linalg.norm(turn.into(proposal.steps[best]))
-        outcome = ratio_test(before, fun, reduction, self.fails)
-        _, failed, held, long, fails, _ = outcome
         radii = self.radius * powers_of_two(len(funs), length.dtype)
         # in the units that the step was made in
         moved = jnp.linalg.norm(proposal.steps[best])
@@ -205,8 +213,6 @@ class QuadraticTrust(eqx.Module):
         radius = jnp.where(failed & ~wait, lower, self.radius)
         radius = jnp.where(held, jnp.maximum(radius, 2 * length), radius)
         radius = jnp.where(proposal.tight & ~self.teaches(), 2 * self.radius, radius)
-        # a check is no step, but a model that is right about it may have converged
-        right = proposal.check & is_right(before, funs[0], proposal.rise)
         ends = settled(self.settled, outcome, moved, radii[best])
         return QuadraticTrust(
             metric=metric,

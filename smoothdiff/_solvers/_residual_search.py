@@ -16,8 +16,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
-from smoothdiff._solvers._first_points import FirstPoints
-from smoothdiff._solvers._history import History, alike, hardly_differ
+from smoothdiff._solvers._first_points import FARTHER, FirstPoints
+from smoothdiff._solvers._history import History, alike
 from smoothdiff._solvers._pilot import Pilot
 from smoothdiff._solvers._point_search import AbstractPointSearch
 from smoothdiff._solvers._residual_trust import Proposal, TrustRegion
@@ -31,8 +31,6 @@ _IDLE, _NARROWER = 6, 0.1
 _VAIN = 0.5
 # so much of the loss at the start is much, where a search should end
 _MUCH = 0.1
-# a sigma is nothing below this share of the largest; its parameter is tried so many times farther
-_BESIDE, _FARTHER = 1e-3, 100.0
 # so many steps in a row that halve the loss, within the width, are trusted again
 _TRUE = 2
 
@@ -222,22 +220,14 @@ class ResidualSearch(AbstractPointSearch):
 
     def _after_first(self, params: Params, funs: Float[Array, " K"]) -> "ResidualSearch":
         first = self.first.after(funs)
-        too_near = self._too_near(params)
-        first = where(first.done() & jnp.any(too_near), first.again(too_near, _FARTHER), first)
+        too_near = self.too_near(params)
+        first = where(first.done() & jnp.any(too_near), first.again(too_near, FARTHER), first)
         stage = jnp.where(first.done(), TRUST, FIRST).astype(self.stage.dtype)
         known = eqx.tree_at(lambda s: (s.stage, s.first), self, (stage, first))
         _, row, _ = self.history.best(self.start)
         moved = ~alike(self.history.rows, row) & self.history.valid
         few = 2 * (1 + jnp.sum(moved)) <= jnp.sum(self.history.valid)
         return where(first.done() & few, known._to_wide(jnp.ones_like(self.wide.scale)), known)
-
-    def _too_near(self, params: Params) -> Bool[Array, " n"]:
-        """Which parameters hardly change the residuals, by steps that are nothing beside others."""
-        history = self.history
-        alone, here = history.alone(self.start)
-        level = hardly_differ(history.rows, history.rows[here])[:, None]
-        flat = jnp.any(alone & level, axis=0) & ~jnp.any(alone & ~level, axis=0)
-        return flat & (params.sigma < _BESIDE * jnp.max(params.sigma))
 
     def _after_local(
         self, row: Array, rows: Array, good: Array, proposal: Proposal

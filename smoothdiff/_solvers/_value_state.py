@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
-from smoothdiff._solvers._first_points import NEARER, FirstPoints
+from smoothdiff._solvers._first_points import FARTHER, NEARER, FirstPoints
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._parameter_scan import Scan
@@ -145,7 +145,8 @@ class ValueState(AbstractPointSearch):
     def narrowed(self, params: Params, over: "ValueState", sizes: Sizes) -> "ValueState":
         """What is `over` if the first points tell of each parameter; else those that do not again.
 
-        Where both of a parameter fail, they come nearer.
+        Where both of a parameter fail, they come nearer; where they are nothing beside others, and
+        change nothing, they go farther.
         """
         history, newest = self.history, self.evaluated + sizes.step
         recent = jnp.arange(len(history.valid), dtype=jnp.int32) >= len(history.valid) - newest
@@ -155,15 +156,16 @@ class ValueState(AbstractPointSearch):
         told = jnp.any(alone & valid, axis=0)
         failed = jnp.any(alone & ~valid & recent[:, None], axis=0) & ~told
         failed &= self.first.reach > _NEAREST
-        nearer = self.first.again(failed, NEARER)
+        near = self.too_near(params) & ~failed
+        again = self.first.again(failed | near, jnp.where(near, FARTHER, NEARER))
         # where the start has no value, from a point that has one
         best, _, fun = history.best(self.start)
         known = jnp.any(history.valid & ~jnp.any(moved, axis=1))
-        first = where(known, nearer, nearer.around(fun))
+        first = where(known, again, again.around(fun))
         # with the radius that a pilot found, as there was no step since
         anew = self.anew(params, jnp.where(known, self.start, best), first, self.trust.radius)
         anew = dataclasses.replace(anew, evaluated=self.evaluated)
-        return where(jnp.any(history.valid) & jnp.any(failed), anew, over)
+        return where(jnp.any(history.valid) & jnp.any(failed | near), anew, over)
 
     def elsewhere(self, params: Params, theta: Float[Array, " n"]) -> "ValueState":
         """The same search from there."""
