@@ -44,8 +44,8 @@ _CLEARLY = 2.0
 
 
 def determined_by(n: int) -> int:
-    """So many evaluations determine a quadratic."""
-    return (n + 1) * (n + 2) // 2
+    """So many evaluations determine a quadratic, as far as a model takes as many."""
+    return min((n + 1) * (n + 2) // 2, _MOST)
 
 
 class Quadratic(NamedTuple):
@@ -92,7 +92,7 @@ def least_change(
     again = history.valid & (length == 0) & (history.funs == fun)
     again &= jnp.arange(len(away)) != jnp.argmax(again)
     everywhere = jnp.where(history.valid & ~again, length, jnp.inf)
-    most = max(min(determined_by(n), _MOST), 2 * n + 1)
+    most = max(determined_by(n), 2 * n + 1)
     nearest, near = jax.lax.top_k(-jnp.asarray(everywhere), min(most, len(away)))
     distance = -jnp.asarray(nearest)
     close = distance[: 2 * n + 1]

@@ -2,9 +2,9 @@ r"""Newton steps within a trust region, one evaluation a step: while a quadratic
 
 Around the best point the function is modelled as $f + g \cdot u + \tfrac12 u \cdot H u$, in the
 coordinates u in which the Hessian is round, as far as it is known: a narrow valley is as easy as a
-bowl. They follow the Hessian of a model that has just predicted, or whose points determine it: of
-fewer a Hessian is a guess, and widths that follow a guess make the next one worse. After a short
-step comes a point that checks the model, see there.
+bowl. They follow the Hessian of a model whose points determine it, or that was right where it was
+checked: of fewer points a Hessian is a guess, and widths that follow a guess make the next one
+worse. After a short step comes a point that checks the model, see there.
 
 Source: the metric is our own.
 """
@@ -32,6 +32,9 @@ _FAR = 2.0
 # so many steps that fail in a row are too many for now, and so many evaluations for each parameter,
 # and one, without a lower point for good
 _FAILS, _SLOW = 5, 10
+# while far points make way for nearer ones, so many failures shrink the radius; none where it is
+# no more than that: there the points, and not the radius, are to blame
+_PATIENCE, _NEAR = 2, 0.5
 
 
 class Proposal(NamedTuple):
@@ -198,7 +201,7 @@ class QuadraticTrust(eqx.Module):
         _, failed, held, long, fails, _ = outcome
         # a check is no step, but a model that is right about it may have converged
         right = proposal.check & is_right(before, funs[0], proposal.rise)
-        usable = all_finite((metric, turn)) & (held | right | proposal.tight | proposal.determined)
+        usable = all_finite((metric, turn)) & (right | proposal.tight | proposal.determined)
         still = Metric.of(jnp.ones_like(proposal.steps[0]), True)
         metric, turn = jax.tree.map(
             lambda a, b: jnp.where(usable, a, b), (metric, turn), (self.metric, still)
@@ -208,7 +211,9 @@ class QuadraticTrust(eqx.Module):
         # in the units that the step was made in
         moved = jnp.linalg.norm(proposal.steps[best])
         # a model of far points is made better before it is trusted less
-        wait = proposal.poor & (fails < 2) & ~long
+        patient = (fails < _PATIENCE) | (self.radius <= _NEAR)
+        wait = proposal.poor & patient & ~long
+        fails = jnp.where(wait, jnp.minimum(fails, _PATIENCE), fails)
         lower = jnp.minimum(self.radius, length) * jnp.where(long, 0.1, 0.5)
         radius = jnp.where(failed & ~wait, lower, self.radius)
         radius = jnp.where(held, jnp.maximum(radius, 2 * length), radius)
