@@ -36,7 +36,7 @@ _ADVICE = {
     "where fun is finite, take a smaller sigma, or set bounds within which it is",
 }
 _OVERFLOW = (
-    ". Residuals count as infinite if half the sum of their squares is: then scale them, or use "
+    ". Half the sum of squares of the residuals was too large for {}: then scale them, or use "
     "float64"
 )
 _UNBOUNDED = (
@@ -159,7 +159,7 @@ class Run:
             y, state, stopped = jax.block_until_ready(self.problem.step(self.y, self.state))
         progress = state.progress
         if not progress.finite:
-            raise self._nonfinite(progress)
+            raise self._nonfinite(progress, bool(progress.overflowed))
         record = Record(
             step=progress.step.item(),
             evaluations=progress.evaluations.item(),
@@ -186,7 +186,7 @@ class Run:
             y, stats = jax.block_until_ready(judged)
         # a last batch that fails costs no more than the smoothed value
         if not jnp.isfinite(stats["fun"]):
-            raise self._nonfinite()
+            raise self._nonfinite(overflowed=bool(jnp.isinf(stats["fun"])))
         numbers = {name: value.item() for name, value in stats.items()}
         return self._result(y, reason, **numbers)
 
@@ -198,9 +198,11 @@ class Run:
     def _is_of_residuals(self) -> bool:
         return isinstance(self._ours(), optx.AbstractLeastSquaresSolver)
 
-    def _nonfinite(self, progress: Progress | None = None) -> MinimiseError:
+    def _nonfinite(self, progress: Progress | None = None, overflowed=False) -> MinimiseError:
         advice = _ADVICE[getattr(self._ours(), "nonfinite", "propagate")]
-        advice += _OVERFLOW if self._is_of_residuals() else ""
+        dtype = self.state.progress.lowest_fun.dtype
+        if overflowed and self._is_of_residuals() and jnp.finfo(dtype).bits < 64:
+            advice += _OVERFLOW.format(dtype)
         return MinimiseError(_NONFINITE + advice, self.found("nonfinite", progress))
 
     def failed(self, error: Exception) -> MinimiseError:

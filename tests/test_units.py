@@ -57,7 +57,7 @@ def test_residuals_whose_squares_are_no_numbers_are_an_error():
     for scale in (1e-17, 1e-30):
         with pytest.raises(ValueError, match=r"too small for float32: return them times 1e\+"):
             solved(sd.least_squares, scaled(scale), UNITS)
-    with pytest.raises(sd.MinimiseError, match="half the sum of their squares"):
+    with pytest.raises(sd.MinimiseError, match="was too large for float32"):
         solved(sd.least_squares, scaled(1e20), UNITS)
     search = sd.Search(UNITS, key=jax.random.key(0), residuals=True)
     with pytest.raises(ValueError, match="use float64"):
@@ -107,8 +107,24 @@ def test_points_that_nobody_chose_may_fail(call):
 
 @calls
 def test_a_function_that_always_fails_is_an_error(call):
-    with pytest.raises(sd.MinimiseError, match="begin where fun is finite"):
+    """Its NaN are not said to be too large a sum of squares."""
+    with pytest.raises(sd.MinimiseError, match="begin where fun is finite") as caught:
         solved(call, lambda y: jnp.full(3, jnp.nan) * y[0], jnp.ones(3))
+    assert "float64" not in str(caught.value)
+
+
+def test_an_infinite_residual_in_float64_is_not_told_to_use_float64(x64):
+    with pytest.raises(sd.MinimiseError, match="begin where fun is finite") as caught:
+        solved(sd.least_squares, lambda y: jnp.full(3, jnp.inf) * y[0], jnp.ones(3))
+    assert "float64" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("value", "said"), [(1e20, True), (np.nan, False)])
+def test_a_batch_says_whether_squares_were_too_large(value, said):
+    residuals = lambda y, args: value * (y + 1)
+    with pytest.raises(sd.MinimiseError, match="NaN or infinite") as caught:
+        sd.least_squares(residuals, jnp.zeros(100), key=jax.random.key(0))
+    assert ("too large for float32" in str(caught.value)) == said
 
 
 @pytest.mark.parametrize("y0", [(0.1, 5.0, 30.0), (2.0, 5.0, 30.0)])

@@ -27,7 +27,8 @@ class Progress(eqx.Module):
     the smoothed function. `best_*` is the lowest estimate so far: lowest by luck as much as by
     merit, hence a candidate and no answer. `lowest_*` is the point of all that were evaluated at
     which the function itself was lowest, and `start_y` where the run began. `finite` turns False
-    when a step failed; the iterate is then the one from before that step.
+    when a step failed; the iterate is then the one from before that step. `overflowed` says that a
+    sum of squares of the last step was infinite, and not NaN.
     """
 
     step: Int[Array, ""]
@@ -36,6 +37,7 @@ class Progress(eqx.Module):
     stderr: Float[Array, ""]
     sigma: Float[Array, ""]
     finite: Bool[Array, ""]
+    overflowed: Bool[Array, ""]
     best_y: PyTree[Array]
     best_smoothed: Float[Array, ""]
     lowest_y: PyTree[Array]
@@ -55,6 +57,7 @@ class Progress(eqx.Module):
             stderr=unknown,
             sigma=unknown,
             finite=good,
+            overflowed=~good,
             best_y=y,
             best_smoothed=unknown,
             lowest_y=y,
@@ -76,6 +79,7 @@ class Progress(eqx.Module):
         evaluations: int | Int[Array, ""],
         finite: Bool[Array, ""],
         seen: Seen,
+        overflowed: Bool[Array, ""] | bool = False,
     ) -> "Progress":
         """The progress after one more step, which estimated the smoothed function at `y`.
 
@@ -100,6 +104,7 @@ class Progress(eqx.Module):
             stderr=stderr,
             sigma=jnp.max(jnp.stack(widths)),
             finite=finite,
+            overflowed=jnp.asarray(overflowed),
             best_y=best_y,
             best_smoothed=best_smoothed,
             lowest_y=lowest_y,

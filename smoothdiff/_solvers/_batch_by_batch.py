@@ -181,7 +181,8 @@ def step(
     after = search.after(scale, history, theta - params.theta, ~same, fun, small)
     new_y, after = unless_failed(finite, (new_y, after), (y, search))
     seen = Seen(params.layout.tree(point), there)
-    progress = progress.after(y, fun, stderr, sigma, batch.count + tried, finite, seen)
+    rest = sigma, batch.count + tried, finite, seen, batch.overflowed
+    progress = progress.after(y, fun, stderr, *rest)
     restarts = state.restarts
     if restarts is not None:
         lowest = progress.best_smoothed < state.progress.best_smoothed

@@ -186,9 +186,8 @@ class PointStep(eqx.Module):
         new_y, after = where(finite, (new_y, after), (self.y, search))
         unknown = jnp.asarray(jnp.nan, theta.dtype)
         seen = Seen(params.layout.tree(point), fun)
-        progress = progress.after(
-            self.y, unknown, unknown, params.sigma * width, sizes.step, finite, seen
-        )
+        rest = params.sigma * width, sizes.step, finite, seen, jnp.any(jnp.isinf(funs))
+        progress = progress.after(self.y, unknown, unknown, *rest)
         restarts, found = state.restarts, state.found
         if solver.restarts:
             lost = later & ~jnp.any(after.history.valid)

@@ -16,7 +16,7 @@ class ResidualBatch(eqx.Module):
     """The first `count` of these rows were evaluated; the `good` ones of them are finite.
 
     All but the `drawn` ones were made for the model alone, and may be anything: they have no part
-    in the estimate of the loss.
+    in the estimate of the loss. The squares of some may have `overflowed`, which are no NaN.
     """
 
     points: Float[Array, "m n"]
@@ -24,6 +24,7 @@ class ResidualBatch(eqx.Module):
     good: Bool[Array, " m"]
     drawn: Bool[Array, " m"]
     count: Int[Array, ""]
+    overflowed: Bool[Array, ""]
 
     @staticmethod
     def of(
@@ -31,9 +32,11 @@ class ResidualBatch(eqx.Module):
     ) -> "ResidualBatch":
         """Rows whose squares are not finite become zeros. Usually all are drawn."""
         there = jnp.arange(len(rows)) < count
-        good = there & jnp.isfinite(jnp.sum(rows**2, axis=1))
+        squares = jnp.sum(rows**2, axis=1)
+        good, overflowed = there & jnp.isfinite(squares), jnp.any(there & jnp.isinf(squares))
         drawn = there if drawn is None else there & drawn
-        return ResidualBatch(points, jnp.where(good[:, None], rows, 0), good, drawn, count)
+        rows = jnp.where(good[:, None], rows, 0)
+        return ResidualBatch(points, rows, good, drawn, count, overflowed)
 
     def enough(self, nonfinite: str) -> Bool[Array, ""]:
         """Whether all that were drawn are good; if some may be dropped, half of all."""

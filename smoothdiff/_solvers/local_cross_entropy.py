@@ -217,7 +217,8 @@ class LocalCrossEntropy(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         # a population over the bounds says nothing of the function around the start
         fun = jnp.where(anywhere, jnp.nan, fun)
         lowest = Seen(params.layout.tree(point), there)
-        progress = progress.after(y, fun, stderr, spread, len(points), finite, lowest)
+        rest = spread, len(points), finite, lowest, seen.overflowed
+        progress = progress.after(y, fun, stderr, *rest)
         return new_y, LocalCrossEntropyState(progress, wide, small), aux
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:

@@ -217,7 +217,8 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         point, there = batch.lowest()
         point, there = jnp.where(at_end < there, theta, point), jnp.minimum(there, at_end)
         seen = Seen(params.layout.tree(point), there)
-        progress = progress.after(y, fun, stderr, sigma, len(points) + _TRIED, finite, seen)
+        rest = sigma, len(points) + _TRIED, finite, seen, batch.overflowed
+        progress = progress.after(y, fun, stderr, *rest)
         return new_y, LocalGaussNewtonState(progress, scale, small), aux
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
