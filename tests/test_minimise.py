@@ -12,6 +12,7 @@ import optimistix as optx
 import pytest
 
 import smoothdiff as sd
+from smoothdiff._black_box import UnknownOutputError
 
 N = 8
 ADAM = sd.FirstOrder(optax.adam(0.05), 0.2, num_samples=N)
@@ -330,6 +331,28 @@ def test_a_mistake_in_a_black_box_is_not_put_down_to_bounds():
     with pytest.raises(sd.MinimiseError, match="promises") as caught:
         sd.minimise(lambda y, args: box(y), jnp.zeros(2), key=KEY)
     assert "bounds" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("out", "error"),
+    [({}, sd.BlackBoxError), ({"out": jnp.float32(0)}, sd.MinimiseError)],
+    ids=["to find what it returns", "of the first step"],
+)
+def test_what_a_first_evaluation_raises_is_the_cause_of_the_error(out, error):
+    """And nothing of ours stands between."""
+    raised = OSError("no scene file")
+
+    def host(y):
+        raise raised
+
+    box = sd.black_box(host, **out)
+    with pytest.raises(error, match="no scene file") as caught:
+        sd.minimise(lambda y, args: box(y), jnp.zeros(2), key=KEY)
+    assert caught.value.__cause__ is raised
+    seen = [caught.value]
+    while (context := seen[-1].__context__) is not None:
+        seen.append(context)
+    assert not any(isinstance(error, UnknownOutputError) for error in seen)
 
 
 def test_a_step_that_is_not_finite_raises_and_keeps_the_result(host):
