@@ -173,3 +173,29 @@ def test_a_limit_ends_a_look():
     assert result.reason == "max_evaluations"
     assert result.evaluations == limit
     np.testing.assert_allclose(result.y, BASIN, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", quick_of(["line", "logarithm", "root"], ["line"]))
+def test_a_function_that_falls_for_ever_has_not_converged(name):
+    """So far from the start that differences are rounding, a point twice as far is lower."""
+    falls = {
+        "line": lambda y, args: -jnp.sum(y),
+        "logarithm": lambda y, args: -jnp.sum(jnp.log1p(jnp.abs(y))),
+        "root": lambda y, args: -jnp.sum(jnp.sqrt(jnp.abs(y))),
+    }
+    for start in (jnp.zeros(2), jnp.full(2, 0.5)):
+        found = sd.minimise(falls[name], start, key=jax.random.key(0))
+        assert found.fun < -50
+        assert found.result != optx.RESULTS.successful
+
+
+def test_a_minimum_far_away_takes_one_more_evaluation():
+    """At 10,000 sigmas, where a point beyond is higher; a near one takes none."""
+    points = []
+    for place in (1e4, 1.0):
+        bowl = watched(lambda y, place=place: jnp.sum((y / place - 1) ** 2), points)
+        found = sd.minimise(bowl, jnp.zeros(2), key=jax.random.key(0), solver=sd.NewtonCG(1.0))
+        assert found.reason == "converged"
+        np.testing.assert_allclose(found.y, place, rtol=1e-3)
+    beyond = np.all(np.abs(np.array(points) - 2e4) < 100, axis=1)
+    assert np.sum(beyond) == 1

@@ -1,8 +1,14 @@
-"""A look over the whole box of the bounds, before a search ends.
+"""A look over the whole box of the bounds, or further on, before a search ends.
 
 A search knows a neighbourhood. Where it ends in a minimum of little depth, a few points anywhere
 are mostly lower; where it found a good one, they cost no more than a first quadratic model.
+
+Where there is no box a search may run off. So far from the start that steps beside the distance are
+small, and differences of values are rounding, it seems to have converged. A point twice as far away
+tells.
 """
+
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -10,19 +16,22 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
-from smoothdiff._solvers._box import bounds_of
+from smoothdiff._solvers._box import bounded, bounds_of, closed
 
 # the seeds of the samples of a search are so many: each look and each search after one has others
 _SEEDS = 2**16
+# a point so many sigmas from the start is farther away than a pilot looks
+_FAR = 1000.0
 
 
 class Look(eqx.Module):
     """How many points were `taken`, and whether the look is `done`.
 
     `before` is the lowest value before it, and `follows` the stage that comes next if nothing is
-    lower. `found` counts the looks that found something lower.
+    lower. `found` counts the looks that found something lower. The run began at the `origin`.
     """
 
+    origin: Float[Array, " n"]
     taken: Int[Array, ""]
     done: Bool[Array, ""]
     before: Float[Array, ""]
@@ -33,21 +42,35 @@ class Look(eqx.Module):
     def start(like: Float[Array, " n"]) -> "Look":
         """Nobody has looked."""
         none = jnp.zeros((), jnp.int32)
-        return Look(none, jnp.asarray(False), jnp.asarray(jnp.inf, like.dtype), none, none)
+        return Look(like, none, jnp.asarray(False), jnp.asarray(jnp.inf, like.dtype), none, none)
 
     @staticmethod
     def length(n: int) -> int:
-        """How many points it takes, of n parameters: as many as a first quadratic model."""
+        """How many points a box takes, of n parameters: as many as a first quadratic model."""
         return 2 * n + 1
+
+    def is_far(self, params: Params, point: Float[Array, " n"]) -> Bool[Array, ""]:
+        """Whether a search may have run off to this point."""
+        return ~has_box(params) & (self._distance(params, point) > _FAR)
+
+    def reach(self, params: Params, point: Float[Array, " n"]) -> Float[Array, ""]:
+        """How far the first points of a search at this point are from it, in sigmas."""
+        half = self._distance(params, point) / 2
+        return jnp.where(has_box(params), jnp.ones_like(half), half)
+
+    def _distance(self, params: Params, point: Float[Array, " n"]) -> Float[Array, ""]:
+        return jnp.max(jnp.abs(point - self.origin) / params.sigma)
 
     def begun(self, before: Float[Array, ""], follows: Int[Array, ""]) -> "Look":
         """Before its first point."""
-        return Look(jnp.zeros_like(self.taken), self.done, before, follows, self.found)
+        none = jnp.zeros_like(self.taken)
+        return Look(self.origin, none, self.done, before, follows, self.found)
 
-    def more(self, count: int, n: int) -> "Look":
-        """With so many points, of n parameters."""
+    def more(self, params: Params, count: int) -> "Look":
+        """With so many points."""
         taken = self.taken + count
-        changed = taken, self.done | (taken >= self.length(n))
+        enough = jnp.where(has_box(params), self.length(len(self.origin)), 1)
+        changed = taken, self.done | (taken >= enough)
         return eqx.tree_at(lambda k: (k.taken, k.done), self, changed)
 
     def again(self) -> "Look":
@@ -55,13 +78,32 @@ class Look(eqx.Module):
         changed = jnp.zeros_like(self.done), self.found + 1
         return eqx.tree_at(lambda k: (k.done, k.found), self, changed)
 
-    def points(self, params: Params, z: Float[Array, "k n"], count: int) -> Float[Array, "K n"]:
-        """The next points, as evenly spread over the box as these normal ones over space."""
-        low, high = bounds_of(params)
+    def points(
+        self,
+        params: Params,
+        best: Float[Array, " n"],
+        draw: Callable[[int], Float[Array, "k n"]],
+        count: int,
+    ) -> Float[Array, "K n"]:
+        """The next points: as evenly spread over the box as normal ones over space.
+
+        Without a box they are beyond the best one, as seen from the start.
+        """
         at = self.taken + jnp.arange(count, dtype=jnp.int32)
+        times = jnp.exp2(at.astype(best.dtype))[:, None]
+        further = best[None] + times * (best - self.origin)[None]
+        if not bounded(params):
+            return further
+        low, high = bounds_of(params)
+        z = draw(self.length(len(best)))
         share = jax.scipy.special.ndtr(z)[jnp.minimum(at, len(z) - 1)]
-        return low[None] + share * (high - low)[None]
+        return jnp.where(closed(params), low[None] + share * (high - low)[None], further)
 
     def seed(self, looking: Bool[Array, ""]) -> Int[Array, ""]:
         """What is added to those of a search's samples."""
         return _SEEDS * (2 * self.found + looking.astype(self.found.dtype))
+
+
+def has_box(params: Params) -> Bool[Array, ""]:
+    """Whether all parameters have finite bounds."""
+    return closed(params) if bounded(params) else jnp.asarray(False)

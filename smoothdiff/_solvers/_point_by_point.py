@@ -84,7 +84,9 @@ def init(
                 "function ends: call minimise from several starts instead"
             )
         search = search.averaging()
-    elif bounded(smoothed_params(solver, y, jnp.asarray(0, jnp.int32), options)):
+    elif not solver.squares or bounded(
+        smoothed_params(solver, y, jnp.asarray(0, jnp.int32), options)
+    ):
         search = dataclasses.replace(search, look=Look.start(search.start))
     if solver.sampler is not None:
         draw = lambda key: _normal_points(solver, key, 1, search.start)

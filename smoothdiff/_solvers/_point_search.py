@@ -11,10 +11,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
 from smoothdiff._solvers._averaging import Average
-from smoothdiff._solvers._box import closed
 from smoothdiff._solvers._first_points import FirstPoints
 from smoothdiff._solvers._history import History, hardly_differ
-from smoothdiff._solvers._look import Look
+from smoothdiff._solvers._look import Look, has_box
 from smoothdiff._solvers._pilot import PAIRS, Pilot
 from smoothdiff._solvers._ratio_test import is_lower
 from smoothdiff._solvers._stages import FIRST, LOOK, PILOT, TRUST, Sizes, where
@@ -246,11 +245,14 @@ class AbstractPointSearch(eqx.Module):
         return where(pilot.length > 0, widened, more)
 
     def looking(self, params: Params, sizes: Sizes, least: Bool[Array, ""]) -> Any:
-        """With a look over all of the box next, if the search would end; not at the `least`."""
+        """With a look over all of the box next, if the search would end; not at the `least`.
+
+        Or with one further on, if it may have run off.
+        """
         if (look := self.look) is None:
             return self
         ended = (self.converged() | self.over(sizes)) & ~look.done & ~self.is_looking()
-        starts = ended & ~least & ~self.is_good() & closed(params)
+        starts = ended & ~least & ~self.is_good() & (has_box(params) | self.may_run_off(params))
         stage = jnp.where(starts, LOOK, self.stage).astype(self.stage.dtype)
         begun = look.begun(self.history.best(self.start)[2], self.stage)
         done = eqx.tree_at(lambda k: k.done, look, look.done | ended | least)
@@ -258,6 +260,10 @@ class AbstractPointSearch(eqx.Module):
 
     def is_good(self) -> Bool[Array, ""]:
         """Whether the lowest point is so low that no look is needed."""
+        return jnp.asarray(False)
+
+    def may_run_off(self, params: Params) -> Bool[Array, ""]:
+        """Whether it seems to have converged, and so far away that there may be no minimum."""
         return jnp.asarray(False)
 
     def looked(self) -> Bool[Array, ""]:
@@ -268,7 +274,7 @@ class AbstractPointSearch(eqx.Module):
         """After so many of its points: a new search where one is lower, or what would follow."""
         assert self.look is not None
         point, _, fun = self.history.best(self.start)
-        look = self.look.more(count, len(point))
+        look = self.look.more(params, count)
         stage = jnp.where(look.done, look.follows, self.stage)
         more = eqx.tree_at(lambda s: (s.stage, s.look), self, (stage, look))
         anew = dataclasses.replace(self.elsewhere(params, point), look=look.again())

@@ -181,7 +181,8 @@ class ResidualSearch(AbstractPointSearch):
         pilot = lambda: (self.pilot_points(params, draw, count), nothing)
         branches = [first, local, wide, pilot]
         if (look := self.look) is not None:
-            branches.append(lambda: (look.points(params, draw(look.length(n)), count), nothing))
+            best = self.history.best(self.start)[0]
+            branches.append(lambda: (look.points(params, best, draw, count), nothing))
         return by_stage(self.stage, stage, branches)
 
     def after(

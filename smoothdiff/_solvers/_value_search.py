@@ -68,7 +68,8 @@ class ValueSearch(ValueState):
         further = lambda: (self.pilot_points(params, draw, count), nothing)
         branches = [first, local, wide, further]
         if (look := self.look) is not None:
-            branches.append(lambda: (look.points(params, draw(look.length(n)), count), nothing))
+            best = self.history.best(self.start)[0]
+            branches.append(lambda: (look.points(params, best, draw, count), nothing))
         if (scan := self.scan) is not None:
             branches.append(lambda: (scan.propose(*bounds_of(params), count), nothing))
         return by_stage(self.stage, stage, branches)

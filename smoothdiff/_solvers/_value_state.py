@@ -169,7 +169,8 @@ class ValueState(AbstractPointSearch):
 
     def elsewhere(self, params: Params, theta: Float[Array, " n"]) -> "ValueState":
         """The same search from there."""
-        anew = self.widened(params, theta, jnp.ones_like(theta[0]))
+        assert self.look is not None
+        anew = self.widened(params, theta, self.look.reach(params, theta))
         return dataclasses.replace(anew, rounds=jnp.zeros_like(self.rounds))
 
     def anew(self, params: Params, theta: Array, first: FirstPoints, width: Array) -> "ValueState":
@@ -177,6 +178,12 @@ class ValueState(AbstractPointSearch):
         names = "pilot", "average", "look", "searches", "rounds", "noisy", "scan", "unchanging"
         anew = self.of(params, theta, width, self.history, first)
         return dataclasses.replace(anew, **{name: getattr(self, name) for name in names})
+
+    def may_run_off(self, params: Params) -> Bool[Array, ""]:
+        """Residuals cannot, as no square is below zero."""
+        if (look := self.look) is None:
+            return jnp.asarray(False)
+        return self.converged() & look.is_far(params, self.history.best(self.start)[0])
 
     def settled(self) -> Bool[Array, ""]:
         """The local model's may be none."""

@@ -67,7 +67,8 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
 
     Within finite bounds a search that would end looks at 2n + 1 points spread over all of the box.
     Where one is lower, it begins anew. A value that is not finite ends nothing there. Searches that
-    `restarts` add do not look.
+    `restarts` add do not look. Where there is no box and it ends more than 1000 sigma from the
+    start, it looks at one point twice as far away: a function that falls for ever has no minimum.
 
     Bounds are never left. A sample beyond them is clamped or, where that would throw it out of a
     narrow valley, pulled back along its ray, and the models take it where it was evaluated.
