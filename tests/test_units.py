@@ -7,6 +7,7 @@ import pytest
 
 import smoothdiff as sd
 from smoothdiff._default_solver import default_solver
+from tests.parts import quick_of
 
 TIMES = jnp.linspace(0, 1, 30)
 UNITS = jnp.array([1e-6, 1.0, 1e3])
@@ -62,6 +63,16 @@ def test_residuals_whose_squares_are_no_numbers_are_an_error():
     search = sd.Search(UNITS, key=jax.random.key(0), residuals=True)
     with pytest.raises(ValueError, match="use float64"):
         search.tell(search.ask(), [scaled(1e-20)(UNITS)])
+
+
+@pytest.mark.parametrize("unit", quick_of([1e20, 1e30, 1e36, 1e-30], [1e30, 1e-30]))
+def test_a_number_may_be_so_large_that_its_square_is_none(unit):
+    """The run ends by itself, as that of an ordinary bowl does."""
+    bowl = lambda y, unit: unit * jnp.sum(jnp.array([1.0, 3.0, 2.0]) * (y - 1) ** 2)
+    start, key = jnp.array([0.5, 2.0, 1.5]), jax.random.key(0)
+    result = sd.minimise(bowl, start, jnp.float32(unit), key=key)
+    assert result.reason == "converged"
+    np.testing.assert_allclose(result.y, 1, atol=1e-5)
 
 
 @calls

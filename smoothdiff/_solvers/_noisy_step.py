@@ -49,6 +49,11 @@ class Trust(eqx.Module):
         none = jnp.zeros((), jnp.int32)
         return Trust(one, math.sqrt(n) * one, 0 * one, jnp.inf * one, none, jnp.asarray(False))
 
+    def times(self, factor: Float[Array, ""]) -> "Trust":
+        """The same in a function with so many times the values."""
+        scaled = self.reduction * factor, self.lowest * factor
+        return eqx.tree_at(lambda t: (t.reduction, t.lowest), self, scaled)
+
 
 class Step(NamedTuple):
     """A step in units of the width, and what speaks for it.

@@ -21,6 +21,8 @@ _CAUTION = 6.0
 # after so many steps in a row that lead nowhere, every second one goes back to the lowest sample,
 # with samples so much narrower
 _LOST, _NARROWER = 6, 0.6
+# of the exponent of the largest number: beyond, squares of numbers and their sums are none
+_EXTREME = 0.4
 
 
 class Center(eqx.Module):
@@ -75,7 +77,9 @@ class Center(eqx.Module):
         the last samples all have one value, `small` whether a step is too small to lead anywhere.
         Where the function `takes_key`, samples are no nearer to each other than noise allows.
         """
-        theta, metric, trust = self.theta, self.metric, self.trust
+        unit = _unit(values, valid)
+        theta, metric, trust = self.theta, self.metric, self.trust.times(1 / unit)
+        values = values / unit
         model = fit(metric.into(points - theta[None]) / trust.width, values, valid)
         before = metric.into(self.accepted - theta) / trust.width
         good, ratio = outcome(model, before, trust.reduction)
@@ -112,7 +116,18 @@ class Center(eqx.Module):
         narrower = _NARROWER * trust.width, jnp.zeros_like(new.reduction)
         there = eqx.tree_at(lambda t: (t.width, t.reduction), new, narrower)
         new = jax.tree.map(lambda a, b: jnp.where(back, a, b), there, new)
-        return Center(x, base, turned, new), value, model.value_stderr(here)
+        after = Center(x, base, turned, new.times(unit))
+        return after, value * unit, model.value_stderr(here) * unit
+
+
+def _unit(values: Float[Array, " m"], valid: Bool[Array, " m"]) -> Float[Array, ""]:
+    """In what values are counted: one, unless squares of how they differ would be no numbers."""
+    lowest = jnp.min(jnp.where(valid, values, jnp.inf))
+    typical = jnp.nanmedian(jnp.where(valid, values - lowest, jnp.nan))
+    limit = float(jnp.finfo(values.dtype).max) ** _EXTREME
+    extreme = jnp.isfinite(typical) & (typical > 0)
+    extreme &= (typical > limit) | (typical < 1 / limit)
+    return jnp.where(extreme, typical, jnp.ones_like(typical))
 
 
 def _adapted(metric: Metric, model: ScalarFit, at: Array) -> tuple[Metric, Metric]:
