@@ -187,7 +187,8 @@ def least_squares(
 
     Returns:
         A `Result`, whose `fun` is half the sum of squares. With `GaussNewton` and fewer than 100
-        parameters it has their `covariance`, `parameter_errors` and `parameter_intervals`.
+        parameters it has their `covariance`, `parameter_errors` and `parameter_intervals`. Those
+        are NaN if `fun` takes a key, until `with_covariance` has evaluated more with a single one.
 
     Raises:
         MinimiseError: a black box failed, or too much was NaN or infinite. Nothing is lost: its

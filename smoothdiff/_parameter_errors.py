@@ -61,7 +61,9 @@ class ParameterErrors:
     unit: Covariance
 
     @staticmethod
-    def of(y: PyTree, answer: Answer, history: History, fun: float) -> "ParameterErrors":
+    def of(
+        y: PyTree, answer: Answer, history: History, fun: float, takes_key: bool
+    ) -> "ParameterErrors":
         """From the evaluations in the history, for half a sum of squares `fun`.
 
         Warns of what is not known, and why.
@@ -84,7 +86,8 @@ class ParameterErrors:
         elif np.any(unknown):
             said.append(
                 f"no error of {_listed(names[unknown])}: the evaluations do not tell how the "
-                "residuals depend on them. " + _why(bool(answer.more), 2 * int(np.sum(~held)))
+                "residuals depend on them. "
+                + _why(bool(answer.more), 2 * int(np.sum(~held)), takes_key)
             )
         if said:
             warnings.warn("; ".join(said), stacklevel=5)
@@ -126,9 +129,14 @@ class ParameterErrors:
         return layout_of(self.answer.y).dtype
 
 
-def _why(further: bool, count: int) -> str:
+def _why(further: bool, count: int, takes_key: bool) -> str:
     """What may help, before and after `with_covariance`."""
-    call = "sd.with_covariance(fun, result, args)"
+    call = f"sd.with_covariance(fun, result, args{', key=key' if takes_key else ''})"
+    if takes_key and not further:
+        return (
+            "Those of a run whose function takes a key have several, which differ by more than "
+            f"slopes do. It takes the {count} evaluations of {call}, which have one"
+        )
     if not further:
         return (
             "Either they do not, or only on a combination, or it takes the "

@@ -79,7 +79,9 @@ class Result:
             three fresh evaluations.
         smoothed: the smoothed function there, from a last batch. If a point of that batch is lower
             still, it becomes `y`. NaN if the run was cut short, or if a sample was not finite.
-        stderr: the standard error of `smoothed`.
+        stderr: the standard error of `smoothed`. NaN where that is of a model and no batch: with
+            `NewtonCG` and `GaussNewton` and fewer than 100 parameters, with a key or without. The
+            errors of parameters are `parameter_errors`.
         evaluations: evaluations of the function, the judgement included; not those of a step that
             was broken off.
         reason: why the run stopped. A limit: "target", "max_steps", "max_evaluations",
@@ -160,7 +162,8 @@ class Result:
         history = kept_residuals(self)
         if self.answer is None or history is None:
             return None
-        return ParameterErrors.of(self.y, self.answer, history, self.fun)
+        takes_key = self.state.search.average is not None
+        return ParameterErrors.of(self.y, self.answer, history, self.fun, takes_key)
 
     @property
     def value(self) -> PyTree[Array]:

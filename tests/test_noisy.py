@@ -253,7 +253,7 @@ def test_errors_of_the_parameters_come_from_evaluations_with_one_key():
     run = sd.least_squares(
         fun, START, data, key=KEY, sigma=0.2, max_evaluations=100, takes_key=True
     )
-    with pytest.warns(UserWarning, match="no error of"):
+    with pytest.warns(UserWarning, match=r"no error of.*args, key=key\), which have one"):
         assert np.all(np.isnan(run.parameter_errors))
     result = sd.with_covariance(fun, run, data, key=KEY)
     result = sd.with_covariance(fun, result, data, key=KEY)
