@@ -54,7 +54,7 @@ class Layout:
         return self.treedef.unflatten(leaves)
 
     def check_vector(self, v: PyTree) -> None:
-        """Raises ValueError if `v` is not like the parameters; nothing is broadcast."""
+        """Raises an error if `v` is not like the parameters; nothing is broadcast."""
         leaves, treedef = jax.tree.flatten(v)
         if treedef != self.treedef or tuple(map(jnp.shape, leaves)) != self.shapes:
             raise ValueError(
@@ -62,6 +62,9 @@ class Layout:
                 f"{self.treedef.unflatten(self.shapes)}, not {jax.tree.map(jnp.shape, v)}: "
                 "smooth_hvp takes (key, x, v, *other_args), mv takes v"
             )
+        for leaf, keep in zip(leaves, self.smoothed, strict=True):
+            if keep and not jnp.issubdtype(dtype := jnp.asarray(leaf).dtype, jnp.inexact):
+                raise TypeError(f"v has dtype {dtype}: pass numbers as jnp.asarray(v, float)")
 
 
 def layout_of(y: PyTree[Array]) -> Layout:

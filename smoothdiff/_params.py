@@ -173,7 +173,8 @@ def _as_real(leaf: Any, name: str) -> Array:
     if not jnp.issubdtype(leaf.dtype, jnp.floating):
         raise TypeError(
             f"the smoothed parameter{name} has dtype {leaf.dtype}: pass real floating-point "
-            "parameters (x.astype(float); round inside the function), or set sigma to None there"
+            "parameters, jnp.asarray(x, float), and round inside the function, or set sigma to "
+            "None there"
         )
     if jnp.finfo(leaf.dtype).bits < 32:
         raise TypeError(

@@ -61,7 +61,7 @@ SIGMA = {
     ),
 }
 PARAMETERS = {
-    "integer": (grad(x=jnp.array([1, 2])), TypeError, "int32.*floating-point"),
+    "integer": (grad(x=jnp.array([1, 2])), TypeError, r"int32.*jnp\.asarray\(x, float\)"),
     "a Python integer": (grad(x=1, fun=lambda x: x), TypeError, "floating-point.*None"),
     "boolean": (grad(x=jnp.array([True])), TypeError, "floating-point"),
     "complex": (grad(x=X.astype(jnp.complex64)), TypeError, "complex64.*real floating-point"),
@@ -174,6 +174,11 @@ VECTORS = {
         lambda: sd.smooth_hvp(tree_fun, 0.5)(KEY, TREE, X),
         ValueError,
         "v must have",
+    ),
+    "integer": (
+        lambda: sd.smooth_hvp(boxes, 0.5)(KEY, X, jnp.ones(2, int)),
+        TypeError,
+        r"v has dtype int32: pass numbers as jnp\.asarray\(v, float\)",
     ),
     "of the argument that is not chosen": (
         lambda: sd.smooth_hvp(lambda x, y: boxes(x) * y, 0.5, argnums=1)(KEY, X, X, 1.0),

@@ -204,6 +204,16 @@ def test_more_whole_numbers_than_points(ax):
     np.testing.assert_allclose(np.ravel(lines(ax)["here"].get_data()), [40, 1600], rtol=1e-5)
 
 
+def test_a_slice_through_whole_numbers_without_a_space_is_of_floats(ax):
+    """As `minimise` takes such a start."""
+    fun = lambda y, args: jnp.sum((y - 1.5) ** 2)
+    key = jax.random.key(0)
+    sd.plot.slice(fun, np.array([2, 1]), sigma=0.25, key=key, parameter=0, points=5, ax=ax)
+    x, f = lines(ax)["function"].get_data()
+    np.testing.assert_allclose(x, [1.0, 5 / 3, 2.0, 7 / 3, 3.0], rtol=1e-5)
+    np.testing.assert_allclose(f, (x - 1.5) ** 2 + 0.25, rtol=1e-5)
+
+
 def test_an_angle_is_shown_in_the_period_that_it_is_in(ax):
     fun = lambda y, args: jnp.cos(y)
     key, angle = jax.random.key(0), 7.0
