@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 
 import smoothdiff as sd
@@ -11,6 +12,7 @@ from tests.parts import quick_of
 
 TIMES = jnp.linspace(0, 1, 30)
 UNITS = jnp.array([1e-6, 1.0, 1e3])
+SOLVER, OPTIONS = sd.GaussNewton(0.2), {"key": jax.random.key(0)}
 FOUND = UNITS * jnp.array([3.0, 2.0, 0.5])
 calls = pytest.mark.parametrize(
     "call", [sd.least_squares, sd.minimise], ids=["residuals", "number"]
@@ -63,6 +65,16 @@ def test_residuals_whose_squares_are_no_numbers_are_an_error():
     search = sd.Search(UNITS, key=jax.random.key(0), residuals=True)
     with pytest.raises(ValueError, match="use float64"):
         search.tell(search.ask(), [scaled(1e-20)(UNITS)])
+
+
+def test_squares_that_vanish_are_no_convergence_under_optimistix():
+    """There is no error there, as values are traced; residuals that are zero have converged."""
+    fit = lambda scale, start: optx.least_squares(
+        lambda y, args: scale * (y - 1), SOLVER, start, options=OPTIONS, max_steps=200, throw=False
+    )
+    found = jax.jit(fit)(jnp.array(1e-24), jnp.zeros(3)).result
+    assert found != optx.RESULTS.successful
+    assert jax.jit(fit)(jnp.array(1e-24), jnp.ones(3)).result == optx.RESULTS.successful
 
 
 @pytest.mark.parametrize("unit", quick_of([1e20, 1e30, 1e36, 1e-30], [1e30, 1e-30]))

@@ -167,7 +167,10 @@ class PointStep(eqx.Module):
             apart = jnp.where(ignored, jnp.inf, _PLATEAU * rounding)
             small &= after.settled() & ~after.plateau(apart)
             small &= after.average is None
-        least = (jnp.minimum(fun, progress.lowest_fun) == 0) & solver.squares
+        # squares so small that all sums are zero say nothing
+        nothing = jnp.all(after.history.funs == 0) & jnp.any(rows != 0) & solver.squares
+        small &= ~nothing
+        least = (jnp.minimum(fun, progress.lowest_fun) == 0) & solver.squares & ~nothing
         least &= after.average is None
         # where a model is wrong, its steps may be short for that: a check comes after the first
         looking = search.is_looking()
