@@ -195,7 +195,7 @@ def test_a_run_that_was_cut_short_needs_more_evaluations():
 def test_where_the_function_takes_a_key_a_warning_says_to_give_one():
     fun = lambda y, data, key: noisy(line, y, 0.1, key) - data
     settings = {"key": KEY, "takes_key": True, "max_evaluations": 12}
-    result = sd.least_squares(fun, START, noisy(line, TRUTH, 0.3), **settings)
+    result: Any = sd.least_squares(fun, START, noisy(line, TRUTH, 0.3), **settings)
     with pytest.warns(UserWarning, match=r"no error of a, b.*result, args, key=key\)"):
         assert np.all(np.isnan(result.covariance))
     assert np.isnan(result.stderr)
