@@ -175,7 +175,7 @@ def test_failures_that_go_on_are_an_error():
 
     def fails_later(y):
         seen.append(y)
-        return np.float32(np.nan if len(seen) > 20 else np.sum((y - 3) ** 2))
+        return np.float32(np.nan if len(seen) > 10 else np.sum((y - 3) ** 2))
 
     box = sd.black_box(fails_later, jax.ShapeDtypeStruct((), np.float32), on_nonfinite="nan")
     with pytest.raises(sd.MinimiseError, match="Too few samples were finite"):

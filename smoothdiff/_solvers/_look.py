@@ -20,8 +20,8 @@ from smoothdiff._solvers._box import bounded, bounds_of, closed
 
 # the seeds of the samples of a search are so many: each look and each search after one has others
 _SEEDS = 2**16
-# a point so many sigmas from the start is farther away than a pilot looks
-_FAR = 1000.0
+# a search that goes so many sigmas has run off, or began with far too few: its end may be rounding
+_FAR = 1e5
 
 
 class Look(eqx.Module):

@@ -25,7 +25,7 @@ from smoothdiff._solvers._least_change import determined_by, least_change
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._model_check import check_step, is_right
 from smoothdiff._solvers._point_search import nothing, powers_of_two
-from smoothdiff._solvers._ratio_test import asks_nothing, ratio_test, settled
+from smoothdiff._solvers._ratio_test import asks_nothing, lost_in_rounding, ratio_test, settled
 
 # an evaluation so many radii away should make way for a nearer one
 _FAR = 2.0
@@ -42,7 +42,7 @@ class Proposal(NamedTuple):
 
     The first may be a `check` that the function rises there as predicted. The radius is `tight`
     where the model promises no more within it than rounding may take, but may beyond. The Hessian
-    is `determined` by as many points as it takes.
+    is `determined` by as many points as it takes. A step may be `lost` in the parameters' rounding.
     """
 
     steps: Float[Array, "K n"]
@@ -53,6 +53,7 @@ class Proposal(NamedTuple):
     rise: Float[Array, ""]
     tight: Bool[Array, ""]
     determined: Bool[Array, ""]
+    lost: Bool[Array, ""]
 
 
 class QuadraticTrust(eqx.Module):
@@ -94,6 +95,7 @@ class QuadraticTrust(eqx.Module):
             rise=zeros(),
             tight=no,
             determined=no,
+            lost=no,
         )
 
     def failed(self) -> Bool[Array, ""]:
@@ -166,7 +168,9 @@ class QuadraticTrust(eqx.Module):
         reduction = reduction.at[0].set(jnp.where(which > 0, 0, reduction[0]))
         poor = (model.farthest > _FAR * self.radius) & (model.used > len(center) + 1)
         determined = model.used >= determined_by(len(center))
-        return Proposal(steps, reduction, hessian, poor, check, rise, asked.tight, determined)
+        lost = lost_in_rounding(self.metric.out(steps[0]), center)
+        said = asked.tight, determined, lost
+        return Proposal(steps, reduction, hessian, poor, check, rise, *said)
 
     def _within_bounds(
         self, hessian: Array, grad: Array, radius: Array, center: Array, params: Params
@@ -198,7 +202,10 @@ class QuadraticTrust(eqx.Module):
             lambda v: dot(hessian, v), jnp.diagonal(hessian), jnp.zeros_like(fun)
         )
         outcome = ratio_test(before, fun, reduction, self.fails)
-        _, failed, held, long, fails, _ = outcome
+        # what rounding may do says nothing against the model
+        more = outcome.more & ~proposal.lost
+        fails = jnp.where(proposal.lost, self.fails, outcome.fails)
+        failed, held, long = outcome.failed & ~proposal.lost, outcome.held, outcome.long
         # a check is no step, but a model that is right about it may have converged
         right = proposal.check & is_right(before, funs[0], proposal.rise)
         usable = all_finite((metric, turn)) & (right | proposal.tight | proposal.determined)
@@ -218,7 +225,8 @@ class QuadraticTrust(eqx.Module):
         radius = jnp.where(failed & ~wait, lower, self.radius)
         radius = jnp.where(held, jnp.maximum(radius, 2 * length), radius)
         radius = jnp.where(proposal.tight & ~self.teaches(), 2 * self.radius, radius)
-        ends = settled(self.settled, outcome, moved, radii[best])
+        outcome = outcome._replace(more=more)
+        ends = settled(self.settled | proposal.lost, outcome, moved, radii[best])
         return QuadraticTrust(
             metric=metric,
             radius=radius,

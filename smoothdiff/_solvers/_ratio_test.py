@@ -76,6 +76,11 @@ def taken_by_rounding(fun: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.sqrt(jnp.finfo(fun.dtype).eps) * jnp.abs(fun)
 
 
+def lost_in_rounding(move: Float[Array, " n"], center: Float[Array, " n"]) -> Bool[Array, ""]:
+    """Whether a step moves parameters by so few roundings that what it promises may be lost."""
+    return jnp.all(jnp.abs(move) <= _NOTHING * jnp.finfo(move.dtype).eps * jnp.abs(center))
+
+
 def is_lower(fun: Float[Array, ""], before: Float[Array, ""]) -> Bool[Array, ""]:
     """Whether a value is lower than another by more than rounding."""
     return before - fun > _NOTHING * jnp.finfo(fun.dtype).eps * jnp.abs(before)

@@ -67,7 +67,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
 
     Within finite bounds a search that would end looks at 2n + 1 points spread over all of the box.
     Where one is lower, it begins anew. A value that is not finite ends nothing there. Searches that
-    `restarts` add do not look. Where there is no box and it ends more than 1000 sigma from the
+    `restarts` add do not look. Where there is no box and it ends more than 1e5 sigma from the
     start, it looks at one point twice as far away: a function that falls for ever has no minimum.
 
     Bounds are never left. A sample beyond them is clamped or, where that would throw it out of a
