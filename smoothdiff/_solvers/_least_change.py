@@ -5,9 +5,10 @@ $$ \min_{g, H} \|H - H_0\|_F, \qquad g \cdot a_i + \tfrac12 a_i \cdot H a_i = f_
 So 2 n + 1 evaluations are enough to begin with; (n + 1)(n + 2) / 2 determine a quadratic.
 
 A function that is none has points that contradict each other: interpolated, those along a line give
-a Hessian that is far too large. Read as the mean of a Gaussian process, whose Hessian varies around
-the last one, the model has an evidence. Where that is clearly higher with a remainder that grows
-with the distance, the points need not be met exactly, the far ones least:
+a Hessian that is far too large. So with a number between these two the points need not be met
+exactly: there is a remainder that grows with the distance. With as many as determine a quadratic,
+or with those to both sides of the center alone, it is taken where the evidence says so. Read as the
+mean of a Gaussian process, whose Hessian varies around the last one, a model has one:
 
 $$ -\tfrac12 (m - n - 1) \log r \cdot w - \tfrac12 \log |\det S| $$
 
@@ -38,7 +39,7 @@ _HIGH, _HIGHEST = 3.0, 1e6
 _RIDGE = {"float32": 1e-7, "float64": 1e-12}
 # what is left of a function that is no quadratic grows as the third power of the distance: this is
 # its variance, against that of the Hessian's entries, where the kernel is about 1
-_REMAINDER = 1e-4
+_REMAINDER = 3e-3
 # the logarithm of the evidence from which on a function is none
 _CLEARLY = 2.0
 
@@ -134,7 +135,9 @@ def least_change(
         return jnp.where(finite, solved.T, 0), jnp.where(finite, evidence, -jnp.inf)
 
     solutions, evidence = jax.vmap(solution)(jnp.asarray([0, _REMAINDER], dtype))
-    solved = solutions[(evidence[1] > evidence[0] + _CLEARLY).astype(jnp.int32)]
+    between = (count > 2 * n + 1) & (count < determined_by(n))
+    inexact = between | (evidence[1] > evidence[0] + _CLEARLY)
+    solved = solutions[inexact.astype(jnp.int32)]
     bent = [dot(a.T * weights[None], a) for weights in solved[:, : len(a)]]
     constants, slopes = solved[:, len(a)], solved[:, len(a) + 1 :] / width
     return Quadratic(

@@ -41,8 +41,8 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     lowers the function faster goes on:
 
     - a local one, around the best point. It interpolates the nearest evaluations, and its Hessian
-      differs least from the last one. Where they say clearly that the function is no quadratic, the
-      farther ones count less. The step that minimises it within the trust region is one
+      differs least from the last one. While they do not determine it, and where they say clearly that
+      the function is no quadratic, the farther ones count less. The step that minimises it within the trust region is one
       evaluation; the radius $\Delta$ grows where the function falls as predicted and shrinks where
       it does not. After a short step one evaluation checks the model: a little farther away, in a
       flat direction that no other point tells of.
