@@ -189,8 +189,8 @@ def test_a_function_that_falls_for_ever_has_not_converged(name):
         assert found.result != optx.RESULTS.successful
 
 
-def test_a_minimum_far_away_takes_one_more_evaluation():
-    """At 1e6 sigmas, where a point beyond is higher; a near one takes none."""
+def test_a_minimum_far_away_is_found_and_looked_beyond():
+    """At 1e6 sigmas it begins anew, and a point beyond is higher; a near one has none."""
     points = []
     for place in (1e6, 1.0):
         bowl = watched(lambda y, place=place: jnp.sum((y / place - 1) ** 2), points)
@@ -198,4 +198,4 @@ def test_a_minimum_far_away_takes_one_more_evaluation():
         assert found.reason == "converged"
         np.testing.assert_allclose(found.y, place, rtol=1e-3)
     beyond = np.all(np.abs(np.array(points) - 2e6) < 1e4, axis=1)
-    assert np.sum(beyond) == 1
+    assert 1 <= np.sum(beyond) <= 2

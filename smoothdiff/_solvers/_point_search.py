@@ -278,7 +278,9 @@ class AbstractPointSearch(eqx.Module):
         stage = jnp.where(look.done, look.follows, self.stage)
         more = eqx.tree_at(lambda s: (s.stage, s.look), self, (stage, look))
         anew = dataclasses.replace(self.elsewhere(params, point), look=look.again())
-        return where(look.done & is_lower(fun, look.before), anew, more)
+        # so far from the start, what is known of the function is that of other places
+        knows_little = self.may_run_off(params) & (look.found == 0)
+        return where(look.done & (is_lower(fun, look.before) | knows_little), anew, more)
 
     def seed(self) -> Int[Array, ""]:
         """Of the next samples: another one for each round, look, and search after one.

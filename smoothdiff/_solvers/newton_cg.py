@@ -41,11 +41,11 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     lowers the function faster goes on:
 
     - a local one, around the best point. It interpolates the nearest evaluations, and its Hessian
-      differs least from the last one. While they do not determine it, and where they say clearly that
-      the function is no quadratic, the farther ones count less. The step that minimises it within the trust region is one
-      evaluation; the radius $\Delta$ grows where the function falls as predicted and shrinks where
-      it does not. After a short step one evaluation checks the model: a little farther away, in a
-      flat direction that no other point tells of.
+      differs least from the last one. While they do not determine it, and where they say clearly
+      that the function is no quadratic, the farther ones count less. The step that minimises it
+      within the trust region is one evaluation; the radius $\Delta$ grows where the function falls
+      as predicted and shrinks where it does not. After a short step one evaluation checks the
+      model: a little farther away, in a flat direction that no other point tells of.
     - a wide one, for functions that jump, have noise or many minima: a regression over samples
       around a center, which gives the smoothed value, gradient and Hessian-vector products in
       closed form, with standard errors. A truncated conjugate-gradient method minimises it. What is
@@ -68,7 +68,8 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     Within finite bounds a search that would end looks at 2n + 1 points spread over all of the box.
     Where one is lower, it begins anew. A value that is not finite ends nothing there. Searches that
     `restarts` add do not look. Where there is no box and it ends more than 1e5 sigma from the
-    start, it looks at one point twice as far away: a function that falls for ever has no minimum.
+    start, it begins anew there once, as wide as the way that it came, and each time looks at one
+    point twice as far away: a function that falls for ever has no minimum.
 
     Bounds are never left. A sample beyond them is clamped or, where that would throw it out of a
     narrow valley, pulled back along its ray, and the models take it where it was evaluated.
