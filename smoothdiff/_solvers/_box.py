@@ -2,7 +2,7 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
 
@@ -29,6 +29,18 @@ def bounds_of(params: Params) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
 def closed(params: Params) -> Bool[Array, ""]:
     """Whether all of these bounds are finite."""
     return jnp.all(jnp.isfinite(jnp.stack(bounds_of(params))))
+
+
+def has_box(params: Params) -> Bool[Array, ""]:
+    """Whether all parameters have finite bounds."""
+    return closed(params) if bounded(params) else jnp.asarray(False)
+
+
+def spread(params: Params, z: Float[Array, "k n"], at: Int[Array, " K"]) -> Float[Array, "K n"]:
+    """Points spread over the box as these normal ones, those `at`, are over space."""
+    low, high = bounds_of(params)
+    share = jax.scipy.special.ndtr(z)[jnp.minimum(at, len(z) - 1)]
+    return low[None] + share * (high - low)[None]
 
 
 def anywhere(params: Params, key: Array, lowest: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -11,12 +11,11 @@ tells.
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
-from smoothdiff._solvers._box import bounded, bounds_of, closed
+from smoothdiff._solvers._box import bounded, closed, has_box, spread
 
 # the seeds of the samples of a search are so many: each look and each search after one has others
 _SEEDS = 2**16
@@ -94,16 +93,9 @@ class Look(eqx.Module):
         further = best[None] + times * (best - self.origin)[None]
         if not bounded(params):
             return further
-        low, high = bounds_of(params)
         z = draw(self.length(len(best)))
-        share = jax.scipy.special.ndtr(z)[jnp.minimum(at, len(z) - 1)]
-        return jnp.where(closed(params), low[None] + share * (high - low)[None], further)
+        return jnp.where(closed(params), spread(params, z, at), further)
 
     def seed(self, looking: Bool[Array, ""]) -> Int[Array, ""]:
         """What is added to those of a search's samples."""
         return _SEEDS * (2 * self.found + looking.astype(self.found.dtype))
-
-
-def has_box(params: Params) -> Bool[Array, ""]:
-    """Whether all parameters have finite bounds."""
-    return closed(params) if bounded(params) else jnp.asarray(False)

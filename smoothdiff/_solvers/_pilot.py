@@ -2,15 +2,20 @@
 
 Around the start of a plateau no model says anything, and rounds of samples find its end late.
 Directions are random, both ways along each, four times as far every time, from the width of the
-first points on.
+first points on. Within a box there are more, anywhere in it: pairs would soon be in its corners.
 """
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from smoothdiff._params import Params
+from smoothdiff._solvers._box import has_box
+
 # how many pairs, each so many times as far as the one before
 PAIRS, _WIDER = 5, 4.0
+# points in a box for each parameter, and one: as many as end a run that finds nothing lower
+_IN_BOX = 20
 
 
 class Pilot(eqx.Module):
@@ -29,9 +34,15 @@ class Pilot(eqx.Module):
         none = jnp.zeros((), jnp.int32)
         return Pilot(none, jnp.zeros((), like.dtype), none)
 
-    def left(self) -> Bool[Array, ""]:
+    @staticmethod
+    def length_in_box(n: int) -> int:
+        """How many points it takes in a box, of n parameters."""
+        return _IN_BOX * (n + 1)
+
+    def left(self, params: Params) -> Bool[Array, ""]:
         """Whether there are more points to try."""
-        return self.tried < 2 * PAIRS
+        most = self.length_in_box(params.theta.size)
+        return self.tried < jnp.where(has_box(params), most, 2 * PAIRS)
 
     def steps(self, z: Float[Array, "k n"], count: int) -> Float[Array, "K n"]:
         """The next points, in units of sigma, along these directions."""

@@ -11,9 +11,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
 from smoothdiff._solvers._averaging import Average
+from smoothdiff._solvers._box import bounded, closed, has_box, spread
 from smoothdiff._solvers._first_points import FirstPoints
 from smoothdiff._solvers._history import History, hardly_differ
-from smoothdiff._solvers._look import Look, has_box
+from smoothdiff._solvers._look import Look
 from smoothdiff._solvers._pilot import PAIRS, Pilot
 from smoothdiff._solvers._ratio_test import is_lower
 from smoothdiff._solvers._stages import FIRST, LOOK, PILOT, TRUST, Sizes, where
@@ -219,19 +220,24 @@ class AbstractPointSearch(eqx.Module):
         flat = jnp.any(alone & level, axis=0) & ~jnp.any(alone & ~level, axis=0)
         return flat & (self.first.reach * params.sigma < _BESIDE * jnp.max(params.sigma))
 
-    def piloting(self) -> Any:
+    def piloting(self, params: Params) -> Any:
         """With the pilot next, if the first points are over and all evaluations hardly differ."""
         rows, valid = self.history.rows, self.history.valid
         same = jnp.all(hardly_differ(rows, rows[jnp.argmax(valid)]) | ~valid)
         stage = jnp.full_like(self.stage, PILOT)
         flat = eqx.tree_at(lambda s: (s.stage, s.pilot.follows), self, (stage, self.stage))
-        return where(same & (self.stage != FIRST) & self.pilot.left(), flat, self)
+        return where(same & (self.stage != FIRST) & self.pilot.left(params), flat, self)
 
     def pilot_points(
         self, params: Params, draw: Callable[[int], Float[Array, "k n"]], count: int
     ) -> Float[Array, "K n"]:
         """The next points of the pilot."""
-        return self.start[None] + params.sigma[None] * self.pilot.steps(draw(PAIRS), count)
+        pairs = self.start[None] + params.sigma[None] * self.pilot.steps(draw(PAIRS), count)
+        if not bounded(params):
+            return pairs
+        at = self.pilot.tried + jnp.arange(count, dtype=jnp.int32)
+        z = draw(self.pilot.length_in_box(len(self.start)))
+        return jnp.where(closed(params), spread(params, z, at), pairs)
 
     def piloted(self, params: Params, new: History) -> Any:
         """After these points of the pilot: the first points again, or what would have followed."""
@@ -239,9 +245,10 @@ class AbstractPointSearch(eqx.Module):
         row = self.history.rows[jnp.argmax(self.history.valid)]
         changed = ~hardly_differ(new.rows, row)
         pilot = self.pilot.after(steps, changed, new.valid)
-        stage = jnp.where(pilot.left(), self.stage, pilot.follows)
+        stage = jnp.where(pilot.left(params), self.stage, pilot.follows)
         more = eqx.tree_at(lambda s: (s.stage, s.pilot), self, (stage, pilot))
-        widened = more.widened(params, self.iterate(), pilot.length)
+        width = jnp.where(has_box(params), 1, pilot.length)
+        widened = more.widened(params, self.iterate(), width)
         return where(pilot.length > 0, widened, more)
 
     def looking(self, params: Params, sizes: Sizes, least: Bool[Array, ""]) -> Any:

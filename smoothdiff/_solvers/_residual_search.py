@@ -200,7 +200,7 @@ class ResidualSearch(AbstractPointSearch):
         branches = [
             lambda: with_rows._after_first(
                 params, jnp.where(new.valid, new.funs, jnp.inf)
-            ).piloting(),
+            ).piloting(params),
             lambda: with_rows._after_local(here[1], new.rows, new.valid, proposal),
             lambda: with_rows._after_wide(params, new.rows, new.valid, sizes),
             lambda: with_rows.piloted(params, new),

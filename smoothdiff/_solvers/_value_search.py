@@ -97,7 +97,7 @@ class ValueSearch(ValueState):
             turn = Turn.start(len(self.start), known.history.best(self.start)[2])
             more = dataclasses.replace(known, first=first)
             over = eqx.tree_at(lambda s: (s.stage, s.turn), more, (stage, turn))
-            over = where(enough, over.compared(), over).piloting()
+            over = where(enough, over.compared(), over).piloting(params)
             return where(enough, more.narrowed(params, over, sizes), over)
 
         def local() -> "ValueSearch":

@@ -216,16 +216,15 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     def reason(self, state: Any) -> str:
         """Small steps, a gradient that is all noise, or too many evaluations for nothing.
 
-        Where all values are the same there is no noise.
+        Where the same point had the same value again there is no noise.
         """
         if isinstance(state, _newton_batches.NewtonBatchState):
             return "noise" if state.center.trust.insignificant else "converged"
         if state.search.converged():
             return "converged"
-        history = state.search.history
-        constant = jnp.all(~history.valid | (history.funs == history.best(state.search.start)[2]))
-        noise = state.search.center.trust.insignificant & ~constant
-        return "noise" if noise else "stalled"
+        search = state.search
+        noisy = search.noisy | (search.average is not None)
+        return "noise" if search.center.trust.insignificant & noisy else "stalled"
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         """Judges the best point, with noise beside others."""
