@@ -3,7 +3,7 @@
 import contextlib
 import inspect
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
@@ -12,6 +12,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Float, PyTree
 
+from smoothdiff._params import check_pair, is_concrete, side_leaves
 from smoothdiff._solvers import AbstractSmoothSolver
 from smoothdiff._solvers._wrapped import wraps_ours
 
@@ -58,14 +59,55 @@ def check_call(fun: Any, y0: Any, bounds: Any, space: Any, takes_key: bool = Fal
                 else "fun is called as fun(y, args): write lambda y, args: fun(y) if it takes y "
                 "alone, and takes_key=True if it takes a key: fun(y, args, key)"
             ) from error
-    pairs = (
-        isinstance(bounds, tuple | list) and len(bounds) > 0 and not isinstance(y0, tuple | list)
-    )
-    if pairs and all(isinstance(b, tuple | list) and len(b) == 2 for b in bounds):
+    check_bounds(bounds, y0)
+
+
+def check_bounds(bounds: Any, y0: PyTree) -> None:
+    """Raises ValueError for bounds in the form of another library, or with nothing in between."""
+    if bounds is None:
+        return
+    if _are_pairs(bounds) and not isinstance(y0, tuple | list):
+        if len(bounds) == 2:
+            raise ValueError(
+                f"bounds={bounds} can be read in two ways. If these are (low, high), write bounds="
+                f"{_arrays(*bounds)}. If they are a pair for each parameter, as in SciPy, write "
+                f"bounds={_arrays(*zip(*bounds, strict=True))}"
+            )
         raise ValueError(
             "bounds must be a pair (low, high), each a number or like y0, not a pair for each "
             "parameter as in SciPy: write low, high = map(jnp.array, zip(*bounds))"
         )
+    check_pair(bounds)
+    lows, highs = (side_leaves(bounds[0], -np.inf, y0), side_leaves(bounds[1], np.inf, y0))
+    sizes = map(np.size, jax.tree.leaves(y0))
+    if sum(sizes) and all(map(_equal, lows, highs)):
+        raise ValueError(
+            "the low and the high bound of every parameter are equal, so there is nothing to "
+            "search: write bounds=(low, high) with low below high for at least one of them"
+        )
+
+
+def _are_pairs(bounds: Any) -> bool:
+    some = isinstance(bounds, tuple | list) and len(bounds) > 0
+    return some and all(isinstance(b, tuple | list) and len(b) == 2 for b in bounds)
+
+
+def _arrays(low: Sequence, high: Sequence) -> str:
+    """How a user writes these sides; None is no bound, as in SciPy."""
+    sides = (low, "-jnp.inf"), (high, "jnp.inf")
+    lists = (", ".join(end if x is None else str(x) for x in side) for side, end in sides)
+    return "({})".format(", ".join(f"jnp.array([{numbers}])" for numbers in lists))
+
+
+def _equal(low: Any, high: Any) -> bool:
+    """Whether two bounds are known to be equal; what is wrong with their shapes is told later."""
+    if not (is_concrete(low) and is_concrete(high)):
+        return False
+    low, high = np.asarray(low), np.asarray(high)
+    try:
+        return bool(np.all(low == high))
+    except ValueError:
+        return False
 
 
 def check_solver(solver: Any, kind: type, example: str, sigma: Any, support: Any) -> None:

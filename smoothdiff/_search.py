@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from smoothdiff._call_checks import check_squares, check_start
+from smoothdiff._call_checks import check_bounds, check_squares, check_start
 from smoothdiff._default_solver import default_solver, share_of_range
 from smoothdiff._host_steps import HostSteps
 from smoothdiff._layout import layout_of
@@ -85,6 +85,7 @@ class Search:
         takes_key: bool = False,
     ):
         check_start(y0)
+        check_bounds(bounds, y0)
         self._units = None if space is None else UnitSpace.of(y0, space)
         if (units := self._units) is not None:
             bounds = units.bounds()

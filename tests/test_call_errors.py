@@ -1,0 +1,77 @@
+"""A call of `minimise` that cannot work says what to write, and what it says works."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import smoothdiff as sd
+
+KEY = jax.random.key(0)
+
+
+def bowl(y, args):
+    return jnp.sum((y - 1) ** 2)
+
+
+def message(error, call):
+    with pytest.raises(error) as info:
+        call()
+    return str(info.value)
+
+
+# bounds
+
+
+@pytest.mark.parametrize(
+    ("bounds", "low_high", "pairs"),
+    [
+        (
+            ([0, 0], [2, 3]),
+            "bounds=(jnp.array([0, 0]), jnp.array([2, 3]))",
+            "bounds=(jnp.array([0, 2]), jnp.array([0, 3]))",
+        ),
+        (
+            [(0, None), (1, 3)],
+            "bounds=(jnp.array([0, -jnp.inf]), jnp.array([1, 3]))",
+            "bounds=(jnp.array([0, 1]), jnp.array([jnp.inf, 3]))",
+        ),
+    ],
+)
+def test_two_pairs_for_two_parameters_can_be_read_in_two_ways(bounds, low_high, pairs):
+    start = jnp.full(2, 0.5)
+    for call in (
+        lambda: sd.minimise(bowl, start, key=KEY, bounds=bounds),
+        lambda: sd.Search(start, key=KEY, bounds=bounds),
+    ):
+        said = message(ValueError, call)
+        assert f"If these are (low, high), write {low_high}. " in said
+        assert f"as in SciPy, write {pairs}" in said
+
+
+def test_integers_are_bounds():
+    bounds = jnp.array([0, 0]), jnp.array([2, 3])
+    search = sd.Search(jnp.full(2, 0.5), key=KEY, bounds=bounds)
+    points = np.stack(search.ask(5))
+    assert np.all((points >= 0) & (points <= [2, 3]))
+
+
+@pytest.mark.parametrize(
+    ("y0", "bounds"),
+    [
+        (1.0, (1.0, 1.0)),
+        (jnp.ones(2), (1.0, jnp.ones(2))),
+        ({"a": 1.0, "b": jnp.ones(2)}, (1.0, {"a": 1.0, "b": jnp.ones(2)})),
+    ],
+)
+def test_bounds_with_nothing_in_between_are_refused(y0, bounds):
+    for call in (
+        lambda: sd.minimise(lambda y, args: 0.0, y0, key=KEY, bounds=bounds),
+        lambda: sd.Search(y0, key=KEY, bounds=bounds),
+    ):
+        assert "nothing to search" in message(ValueError, call)
+
+
+def test_some_parameters_may_have_equal_bounds():
+    search = sd.Search(jnp.ones(2), key=KEY, bounds=(1.0, jnp.array([1.0, 2.0])))
+    assert all(y[0] == 1 for y in search.ask(3))
