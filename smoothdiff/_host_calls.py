@@ -26,6 +26,10 @@ _log = logging.getLogger("smoothdiff")
 _OURS = os.path.dirname(__file__), os.path.dirname(concurrent.futures.__file__)
 # calls that an error shows of those that may have brought a pool down
 _SHOWN = 4
+_FIRST = (
+    "(This call was to find what the function returns, so it cannot be a NaN: give `out`, as "
+    "sd.black_box(fun, out=0.0, ...) for one number, or begin at another start)"
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -81,7 +85,10 @@ class HostFunction:
         if self.store is not None:
             self.store.settle()
         if outcome.error is not None:
-            raise self._failure(samples, outcome, outcome.error) from outcome.error
+            failure = self._failure(samples, outcome, outcome.error)
+            if self.on_error == "nan":
+                failure = _at_point(f"{failure}\n{_FIRST}")
+            raise failure from outcome.error
         return outcome.value
 
     def accept(

@@ -75,3 +75,18 @@ def test_bounds_with_nothing_in_between_are_refused(y0, bounds):
 def test_some_parameters_may_have_equal_bounds():
     search = sd.Search(jnp.ones(2), key=KEY, bounds=(1.0, jnp.array([1.0, 2.0])))
     assert all(y[0] == 1 for y in search.ask(3))
+
+
+# black boxes
+
+
+def test_a_first_call_that_fails_says_to_give_out():
+    def fails(y):
+        raise ArithmeticError("no convergence")
+
+    box = sd.black_box(fails, on_error="nan")
+    said = message(sd.BlackBoxError, lambda: box(jnp.ones(2)))
+    assert "give `out`, as sd.black_box(fun, out=0.0, ...)" in said
+    assert "another start" in said
+    assert jnp.isnan(sd.black_box(fails, out=0.0, on_error="nan")(jnp.ones(2)))
+    assert "give `out`" not in message(sd.BlackBoxError, lambda: sd.black_box(fails)(jnp.ones(2)))
