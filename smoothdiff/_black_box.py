@@ -228,8 +228,9 @@ def _unknown(name: str, args: tuple) -> str:
     given = ", ".join(str(jax.tree.map(lambda a: f"{a.dtype}{list(a.shape)}", arg)) for arg in args)
     return (
         f"it is not known yet what the black box {name!r} returns for ({given}), and while JAX "
-        "traces (jit, vmap, grad, the transforms smooth_...) it cannot be called to find out: call "
-        f"it once before, with arrays of these shapes, or write sd.black_box({name}, "
+        "traces (jit, vmap, grad, the transforms smooth_...) it cannot be called to find out: make "
+        "it once, outside of the function that is traced, as another box is new each time, and "
+        f"call it once before, with arrays of these shapes; or write sd.black_box({name}, "
         "out=jax.ShapeDtypeStruct((), jnp.float32)) with the shape and dtype of what it returns"
     )
 

@@ -90,3 +90,12 @@ def test_a_first_call_that_fails_says_to_give_out():
     assert "another start" in said
     assert jnp.isnan(sd.black_box(fails, out=0.0, on_error="nan")(jnp.ones(2)))
     assert "give `out`" not in message(sd.BlackBoxError, lambda: sd.black_box(fails)(jnp.ones(2)))
+
+
+def test_a_box_that_is_made_within_the_function_is_to_be_made_outside():
+    total = lambda y: np.sum(np.floor(y))
+    said = message(
+        TypeError,
+        lambda: sd.minimise(lambda y, args: sd.black_box(total)(y), jnp.ones(2), key=KEY),
+    )
+    assert "make it once, outside of the function" in said
