@@ -57,7 +57,8 @@ def check_call(fun: Any, y0: Any, bounds: Any, space: Any, takes_key: bool = Fal
                 "no key, and write lambda y, args, key: fun(y, key) if it takes no args"
                 if takes_key
                 else "fun is called as fun(y, args): write lambda y, args: fun(y) if it takes y "
-                "alone, and takes_key=True if it takes a key: fun(y, args, key)"
+                "alone; box = sd.black_box(fun), then lambda y, args: box(y), if it is not JAX; "
+                "and takes_key=True if it takes a key: fun(y, args, key)"
             ) from error
     check_bounds(bounds, y0)
 
@@ -182,6 +183,7 @@ def explained() -> Iterator[None]:
         yield
     except _HOST as error:
         raise TypeError(
-            "fun does what JAX cannot trace, such as NumPy on its arguments: wrap what is not "
-            "JAX in sd.black_box(fun, out), or use jax.numpy"
+            "fun does what JAX cannot trace, such as NumPy on its arguments: use jax.numpy, or "
+            "wrap it once, box = sd.black_box(fun), and give lambda y, args: box(y), or "
+            "box(y, args) if it takes both"
         ) from error

@@ -99,3 +99,21 @@ def test_a_box_that_is_made_within_the_function_is_to_be_made_outside():
         lambda: sd.minimise(lambda y, args: sd.black_box(total)(y), jnp.ones(2), key=KEY),
     )
     assert "make it once, outside of the function" in said
+
+
+def test_a_function_of_numpy_is_told_how_to_be_wrapped():
+    total = lambda y: np.sum(np.floor(y))
+    start, box = jnp.ones(2), sd.black_box(total)
+    calls = [
+        lambda: sd.minimise(total, start, key=KEY),
+        lambda: sd.minimise(box, start, key=KEY),
+        lambda: sd.minimise(lambda y, args: total(y), start, key=KEY),
+        lambda: sd.recommend(lambda y, args: total(y), start, key=KEY),
+    ]
+    for call in calls:
+        said = message(TypeError, call)
+        assert "box = sd.black_box(fun)" in said
+        assert "lambda y, args: box(y)" in said
+    of_both = sd.black_box(lambda y, args: np.sum(np.floor(y)))
+    for fun in (lambda y, args: box(y), lambda y, args: of_both(y, args)):
+        assert sd.recommend(fun, start, key=KEY).run == "minimise"
