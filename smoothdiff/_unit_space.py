@@ -1,7 +1,7 @@
 """The parameters of a run in unit coordinates: a pytree of spaces beside its start."""
 
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -11,6 +11,8 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from smoothdiff._spaces import SIGMA, AbstractSpace, floating
+
+_LEAF = jax.tree.structure(0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,6 +135,14 @@ def _entries(spaces: PyTree, y0: PyTree, treedef: Any) -> list[AbstractSpace | N
     try:
         full = jax.tree.broadcast(spaces, y0, is_leaf=is_entry)
     except ValueError as error:
+        one_array = treedef == _LEAF and np.ndim(y0) > 0
+        if one_array and isinstance(spaces, list | tuple) and len(spaces) > 1:
+            raise ValueError(
+                f"space has {len(spaces)} entries, and y0 is one array: for numbers of one kind "
+                f"write one space, {_together(spaces)}; where kinds differ make y0 a dict of "
+                'parameters, and space too, such as y0={"a": 1.0, "b": 2}, space={"a": '
+                'sd.Range(0, 2), "b": sd.Integer(1, 3)}'
+            ) from error
         raise ValueError(
             "space must be one space, such as Range(0, 1), or a pytree of spaces and None with the "
             f"structure of the parameters, {treedef}, not "
@@ -147,6 +157,18 @@ def _entries(spaces: PyTree, y0: PyTree, treedef: Any) -> list[AbstractSpace | N
                 "a parameter that is passed as it is"
             )
     return entries
+
+
+def _together(spaces: Sequence) -> str:
+    """How to write spaces of one kind as one; an example where they are not."""
+    first = spaces[0]
+    kind, log = type(first), getattr(first, "log", False)
+    same = all(type(s) is kind and getattr(s, "log", False) == log for s in spaces)
+    if not (same and hasattr(first, "low") and hasattr(first, "high")):
+        return "such as sd.Range(jnp.array([0, 0]), jnp.array([2, 3]))"
+    low, high = ([getattr(s, end) for s in spaces] for end in ("low", "high"))
+    more = ", log=True" if log else ""
+    return f"sd.{kind.__name__}(jnp.array({low}), jnp.array({high}){more})"
 
 
 def _labels(label: Any, name: str, shape: tuple[int, ...]) -> list[str]:

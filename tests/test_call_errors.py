@@ -77,6 +77,42 @@ def test_some_parameters_may_have_equal_bounds():
     assert all(y[0] == 1 for y in search.ask(3))
 
 
+# spaces
+
+
+@pytest.mark.parametrize(
+    ("space", "written"),
+    [
+        (
+            [sd.Range(0, 2), sd.Range(0, 3)],
+            "space, sd.Range(jnp.array([0.0, 0.0]), jnp.array([2.0, 3.0]));",
+        ),
+        (
+            [sd.Range(1, 2, log=True), sd.Range(2, 3, log=True)],
+            "space, sd.Range(jnp.array([1.0, 2.0]), jnp.array([2.0, 3.0]), log=True);",
+        ),
+        (
+            (sd.Integer(0, 2), sd.Integer(1, 3)),
+            "space, sd.Integer(jnp.array([0, 1]), jnp.array([2, 3]));",
+        ),
+        ([sd.Range(0, 2), None], "such as sd.Range(jnp.array([0, 0]), jnp.array([2, 3]));"),
+        ([sd.Range(1, 2), sd.Range(1, 2, log=True)], "such as sd.Range("),
+    ],
+)
+def test_a_list_of_spaces_for_one_array_is_to_be_one_space_or_a_dict(space, written):
+    said = message(ValueError, lambda: sd.minimise(bowl, jnp.ones(2), key=KEY, space=space))
+    assert written in said
+    assert "make y0 a dict of parameters" in said
+
+
+def test_the_spaces_that_are_advised_are_spaces():
+    search = sd.Search(jnp.ones(2), key=KEY, space=sd.Range(jnp.array([0, 0]), jnp.array([2, 3])))
+    assert np.all(np.stack(search.ask(3)) <= [2, 3])
+    space = {"a": sd.Range(0, 2), "b": sd.Integer(1, 3)}
+    search = sd.Search({"a": 1.0, "b": 2}, key=KEY, space=space)
+    assert all(0 <= y["a"] <= 2 and y["b"] in (1, 2, 3) for y in search.ask(3))
+
+
 # black boxes
 
 
