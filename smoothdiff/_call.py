@@ -16,7 +16,15 @@ from smoothdiff._batch import Batch, evaluate
 from smoothdiff._estimate import combine, displacement, objective
 from smoothdiff._named_baselines import as_baseline
 from smoothdiff._noise import Noise, as_sampler
-from smoothdiff._params import Params, as_argnums, as_key, choose, is_concrete, replace, take_apart
+from smoothdiff._params import (
+    Params,
+    as_argnums,
+    as_first_key,
+    choose,
+    is_concrete,
+    replace,
+    take_apart,
+)
 from smoothdiff._reraise import reraise
 from smoothdiff._samplers import AbstractSampler
 from smoothdiff._sharding import as_sharding
@@ -126,7 +134,9 @@ class Call:
             )
 
     def params(self, key: Any, args: tuple) -> Params:
-        as_key(key)  # first, or else what was passed in place of a key is taken for a parameter
+        as_first_key(
+            key
+        )  # first, or else what was passed in place of a key is taken for a parameter
         return take_apart(choose(args, self.argnums), self.sigma, self.bounds)
 
     def batch(
@@ -157,7 +167,7 @@ class Call:
         return evaluate(
             fun,
             params,
-            as_key(key),
+            as_first_key(key),
             num_samples=self.num_samples,
             sampler=as_sampler(self.sampler, self.noise),
             baseline=as_baseline("mean" if plain else self.baseline),

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import PyTree
 
 from smoothdiff._call import Options
-from smoothdiff._params import as_key
+from smoothdiff._params import as_first_key
 from smoothdiff._samplers import Sobol
 
 # as many as cost little beside one picture; in replicates, so that fits to them leave one out
@@ -75,7 +75,8 @@ def control_variate(
 
     def g(key: Any, *args: Any) -> PyTree:
         first, second = (
-            part(k, *args) for part, k in zip(parts, jax.random.split(as_key(key)), strict=True)
+            part(k, *args)
+            for part, k in zip(parts, jax.random.split(as_first_key(key)), strict=True)
         )
         if not options.get("stderr", False):
             return jax.tree.map(jnp.add, first, second)

@@ -22,7 +22,7 @@ from smoothdiff import kernels
 from smoothdiff._baselines import AbstractBaseline
 from smoothdiff._call import Call
 from smoothdiff._estimate import objective
-from smoothdiff._params import as_key
+from smoothdiff._params import as_first_key
 from smoothdiff._samplers import PointSampler
 
 
@@ -148,7 +148,7 @@ class Importance(eqx.Module):
 
         # the elements that are sampled: parameters twice, or pairs i <= j
         pairs = np.stack([np.arange(n)] * 2 if order == 1 else np.triu_indices(n), axis=1)
-        keys = jax.vmap(lambda e: jax.random.fold_in(as_key(key), e))(jnp.arange(len(pairs)))
+        keys = jax.vmap(lambda e: jax.random.fold_in(as_first_key(key), e))(jnp.arange(len(pairs)))
         out = jax.lax.map(element, (jnp.asarray(pairs), keys)).astype(params.theta.dtype)
         if order == 1:
             return tree(out / params.sigma)

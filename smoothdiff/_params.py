@@ -20,17 +20,32 @@ def is_concrete(x: Any) -> bool:
 
 
 def as_key(key: Any) -> Array:
-    """A typed key from a typed or raw one."""
+    """A typed key from a typed or raw one, which was given by keyword.
+
+    Raises:
+        TypeError: it is not one key.
+    """
+    given = f"{type(key).__name__}{list(key.shape) if hasattr(key, 'shape') else ''}"
+    return _typed(key, f"key must be one random key: write key=jax.random.key(0), not {given}")
+
+
+def as_first_key(key: Any) -> Array:
+    """As `as_key`, for the first argument of what a transform returns."""
+    return _typed(
+        key,
+        "the first argument must be one random key: call g(jax.random.key(0), *args), "
+        f"not g({type(key).__name__}, ...); for many keys use jax.vmap",
+    )
+
+
+def _typed(key: Any, advice: str) -> Array:
     dtype = getattr(key, "dtype", None)
     if dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key):
         if key.ndim == 0:
             return key
     elif dtype == jnp.uint32 and key.ndim == 1 and key.size in (2, 4):
         return jax.random.wrap_key_data(key)
-    raise TypeError(
-        "the first argument must be one random key: call g(jax.random.key(0), *args), "
-        f"not g({type(key).__name__}, ...); for many keys use jax.vmap"
-    )
+    raise TypeError(advice)
 
 
 def as_argnums(argnums: int | Sequence[int], num_args: int) -> tuple[int, ...]:

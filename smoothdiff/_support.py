@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
-from smoothdiff._params import as_key, take_apart
+from smoothdiff._params import as_first_key, take_apart
 
 
 class AbstractSupport(eqx.Module):
@@ -241,7 +241,7 @@ def probe_support(
     def g(key: Key[Array, ""], x: PyTree, *args: Any) -> MatrixSupport:
         params = take_apart(x, sigma, None)
         n = params.theta.size
-        pool, move = jax.random.split(as_key(key))
+        pool, move = jax.random.split(as_first_key(key))
         probes = num_samples - 1
         moved = jax.random.bernoulli(pool, 1 / (2 * reach), (probes, n))
         z = jnp.where(moved, jax.random.normal(move, (probes, n), params.theta.dtype), 0)

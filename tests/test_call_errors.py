@@ -14,6 +14,10 @@ def bowl(y, args):
     return jnp.sum((y - 1) ** 2)
 
 
+def bowl_of_key(y, args, key):
+    return bowl(y, args)
+
+
 def message(error, call):
     with pytest.raises(error) as info:
         call()
@@ -153,3 +157,17 @@ def test_a_function_of_numpy_is_told_how_to_be_wrapped():
     of_both = sd.black_box(lambda y, args: np.sum(np.floor(y)))
     for fun in (lambda y, args: box(y), lambda y, args: of_both(y, args)):
         assert sd.recommend(fun, start, key=KEY).run == "minimise"
+
+
+# keys
+
+
+def test_a_key_that_is_not_one_is_told_the_keyword():
+    start, calls = jnp.ones(2), [sd.minimise, sd.recommend]
+    for key in (0, jax.random.split(KEY)):
+        said = [message(TypeError, lambda c=c, k=key: c(bowl, start, key=k)) for c in calls]
+        said.append(message(TypeError, lambda k=key: sd.Search(start, key=k)))
+        said.append(
+            message(TypeError, lambda k=key: sd.minimise(bowl_of_key, start, key=k, takes_key=True))
+        )
+        assert all("write key=jax.random.key(0)" in text for text in said)
