@@ -114,7 +114,29 @@ def test_bounds_hold():
     sd.minimise(lambda y, _: box(y), jnp.zeros(2), key=KEY, sigma=0.1, bounds=bounds, max_steps=15)
     assert np.min(seen) >= -1
     assert np.max(seen) <= 2
-    assert np.min(seen) == -1
+    # all over the box, and not on its faces
+    assert np.ptp(seen) > 2
+    assert np.mean(np.all((np.array(seen) > -1) & (np.array(seen) < 2), axis=1)) > 0.9
+
+
+@pytest.mark.parametrize("residuals", [pytest.param(False, marks=pytest.mark.slow), True])
+def test_a_needle_in_a_box_is_found_as_often_as_by_random_points(residuals):
+    """One of 67 points is on it; the start is on the plateau around it."""
+    found = 0
+    for seed in range(4):
+        needle = jax.random.uniform(jax.random.key(seed), (4,), minval=0.2, maxval=0.8)
+
+        def rows(y, args, needle=needle):
+            away = y - needle
+            return jnp.where(jnp.max(jnp.abs(away)) < 0.175, away, 1.0)
+
+        def fun(y, args, rows=rows):
+            return jnp.sum(rows(y, args) ** 2) / 2
+
+        call, of = (sd.least_squares, rows) if residuals else (sd.minimise, fun)
+        settings = {"key": jax.random.key(seed), "bounds": (0.0, 1.0), "max_evaluations": 200}
+        found += call(of, jnp.full(4, 0.05), **settings).fun < 0.1
+    assert found >= 3
 
 
 @pytest.mark.slow
