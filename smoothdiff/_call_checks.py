@@ -60,13 +60,18 @@ def check_call(fun: Any, y0: Any, bounds: Any, space: Any, takes_key: bool = Fal
                 "alone; box = sd.black_box(fun), then lambda y, args: box(y), if it is not JAX; "
                 "and takes_key=True if it takes a key: fun(y, args, key)"
             ) from error
-    check_bounds(bounds, y0)
+    check_bounds(bounds, y0, space)
 
 
-def check_bounds(bounds: Any, y0: PyTree) -> None:
+def check_bounds(bounds: Any, y0: PyTree, space: Any = None) -> None:
     """Raises ValueError for bounds in the form of another library, or with nothing in between."""
     if bounds is None:
         return
+    if space is not None:
+        raise ValueError(
+            "give a space or bounds: a space has bounds of its own, sd.Range(low, high) for each "
+            "parameter, and None for one without"
+        )
     if _are_pairs(bounds) and not isinstance(y0, tuple | list):
         if len(bounds) == 2:
             raise ValueError(

@@ -85,7 +85,7 @@ class Search:
         takes_key: bool = False,
     ):
         check_start(y0)
-        check_bounds(bounds, y0)
+        check_bounds(bounds, y0, space)
         self._units = None if space is None else UnitSpace.of(y0, space)
         if (units := self._units) is not None:
             bounds = units.bounds()

@@ -171,3 +171,10 @@ def test_a_key_that_is_not_one_is_told_the_keyword():
             message(TypeError, lambda k=key: sd.minimise(bowl_of_key, start, key=k, takes_key=True))
         )
         assert all("write key=jax.random.key(0)" in text for text in said)
+
+
+@pytest.mark.parametrize("call", [sd.minimise, sd.least_squares, sd.Search])
+def test_bounds_beside_a_space_are_refused(call):
+    first = (jnp.ones(2),) if call is sd.Search else (lambda y, args: y, jnp.ones(2))
+    with pytest.raises(ValueError, match="a space or bounds"):
+        call(*first, key=jax.random.key(0), space=sd.Range(0.0, 2.0), bounds=(0.0, 1.0))

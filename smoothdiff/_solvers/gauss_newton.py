@@ -45,7 +45,8 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
       nearer one. Where the residuals hardly change, and sigma is below a thousandth of the
       largest, as for a parameter that is zero but for rounding, a farther one follows. If all
       residuals hardly differ, pairs of points follow, each four times as far away, up to a thousand
-      sigma. Where these find a change, the first points are taken again.
+      sigma, or within finite bounds points anywhere. Where these find a change, the first points
+      are taken again.
     - **The local model** needs one evaluation a step. $y_t$ is the best point. J fits the nearest
       points, and of all that do it differs least from the last J. The radius $\Delta$ grows if the
       reduction is as predicted, and shrinks if the loss does not fall.
