@@ -37,8 +37,8 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     With fewer than 100 parameters the function is evaluated point by point. The first points are
     the start, and one sigma from it to both sides along each parameter. Where they hardly differ,
     pairs of points follow, each four times as far away, up to a thousand sigma, or within finite
-    bounds points anywhere, and then the first points again where these found a change. Then two models take turns, and the one that
-    lowers the function faster goes on:
+    bounds points anywhere, and then the first points again where these found a change. Then two
+    models take turns, and the one that lowers the function faster goes on:
 
     - a local one, around the best point. It interpolates the nearest evaluations, and its Hessian
       differs least from the last one. While they do not determine it, and where they say clearly
