@@ -73,7 +73,7 @@ def check_bounds(bounds: Any, y0: PyTree, space: Any = None) -> None:
             "parameter, and None for one without"
         )
     if _are_pairs(bounds) and not isinstance(y0, tuple | list):
-        if len(bounds) == 2:
+        if len(bounds) == 2 and jnp.shape(y0) == (2,):
             raise ValueError(
                 f"bounds={bounds} can be read in two ways. If these are (low, high), write bounds="
                 f"{_arrays(*bounds)}. If they are a pair for each parameter, as in SciPy, write "

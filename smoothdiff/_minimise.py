@@ -48,8 +48,8 @@ def minimise(
     largest of them: those of which, sorted, none is more than ten times the one before. A zero has
     the geometric mean of the others of its leaf. If all are zero, sigma is 0.2. If all first points
     of `NewtonCG` have the same value, or hardly differ beyond rounding, it looks up to a thousand
-    sigma away; where it finds a change, it takes the first points again. A
-    parameter that changes nothing stays where it was.
+    sigma away, or within finite bounds anywhere; if it finds a change, it takes the first points
+    again. A parameter that changes nothing stays where it was.
 
     But for rounding, the iterates are those of `optimistix.minimise(fun, solver, y0, args,
     options={"key": key})`, with `"bounds": bounds` in the options if there are any.

@@ -36,8 +36,7 @@ _ADVICE = {
     "where fun is finite, take a smaller sigma, or set bounds within which it is",
 }
 _OVERFLOW = (
-    ". Half the sum of squares of the residuals was too large for {}: then scale them, or use "
-    "float64"
+    ". Half the sum of squares of the residuals was too large for {}: scale them, or use float64"
 )
 _UNBOUNDED = (
     "\nNothing bounds the search: bounds=(low, high), or a space, keeps it to points where fun can "
@@ -186,7 +185,7 @@ class Run:
             y, stats = jax.block_until_ready(judged)
         # a last batch that fails costs no more than the smoothed value
         if not jnp.isfinite(stats["fun"]):
-            raise self._nonfinite(overflowed=bool(jnp.isinf(stats["fun"])))
+            raise self._nonfinite()
         numbers = {name: value.item() for name, value in stats.items()}
         return self._result(y, reason, **numbers)
 

@@ -120,7 +120,7 @@ def test_bounds_hold():
 
 
 @pytest.mark.parametrize("residuals", [pytest.param(False, marks=pytest.mark.slow), True])
-def test_a_needle_in_a_box_is_found_as_often_as_by_random_points(residuals):
+def test_a_needle_in_a_box_is_found(residuals):
     """One of 67 points is on it; the start is on the plateau around it."""
     found = 0
     for seed in range(4):
@@ -128,7 +128,9 @@ def test_a_needle_in_a_box_is_found_as_often_as_by_random_points(residuals):
 
         def rows(y, args, needle=needle):
             away = y - needle
-            return jnp.where(jnp.max(jnp.abs(away)) < 0.175, away, 1.0)
+            # beside it is a hill, and some of the box fails
+            around = jnp.where(y[0] > 0.9, 1.2, jnp.where(y[1] > 0.95, jnp.nan, 1.0))
+            return jnp.where(jnp.max(jnp.abs(away)) < 0.175, away, around)
 
         def fun(y, args, rows=rows):
             return jnp.sum(rows(y, args) ** 2) / 2

@@ -211,3 +211,29 @@ def test_evaluations_that_all_came_back_to_the_center_leave_the_others_in_the_mo
     history = known(np.concatenate([around(2 * N + 1), again]), lambda x: x @ x)
     _, proposal, *_ = proposal_of(history)
     np.testing.assert_allclose(proposal.hessian, 2 * np.eye(N), atol=1e-6)
+
+
+def test_a_step_within_rounding_says_nothing_against_the_model(x64):
+    trust, proposal, _, fun = proposal_of(known(around(10)))
+    higher = jnp.asarray([fun + 1]), jnp.ones(1, bool)
+    lost = proposal._replace(lost=jnp.asarray(True))
+    after = REVISE(trust, lost, jnp.asarray(fun), *higher)
+    assert (after.radius, after.fails) == (trust.radius, 0)
+
+
+@pytest.mark.parametrize(("radius", "shrinks"), [(4.0, True), (0.4, False)])
+def test_near_points_replace_far_ones_before_a_small_radius_shrinks(x64, radius, shrinks):
+    trust, proposal, _, fun = proposal_of(known(around(10)), radius=radius)
+    poor = proposal._replace(poor=jnp.asarray(True))
+    for _ in range(4):
+        trust = REVISE(trust, poor, jnp.asarray(fun), jnp.asarray([fun + 1e-9]), jnp.ones(1, bool))
+        assert trust.improve
+    assert (trust.radius < radius) == shrinks
+    assert not trust.stuck()
+
+
+def test_points_that_do_not_determine_a_quadratic_are_not_met_exactly(x64):
+    """The straight part of a function with a kink is believed more than the far side of it."""
+    kink = lambda x: bowl(x) + 10 * np.maximum(x[0] - 0.5, 0)
+    hessians = [np.asarray(proposal_of(known(around(count), kink))[1].hessian) for count in (9, 10)]
+    assert np.linalg.norm(hessians[0] - HESSIAN) < np.linalg.norm(hessians[1] - HESSIAN)

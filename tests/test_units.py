@@ -170,7 +170,10 @@ def test_samples_that_fail_come_nearer_to_the_best_point(place, seed):
 
 
 def test_failures_that_go_on_are_an_error():
-    """Numbers that came first do not keep a run going that has none any more."""
+    """Numbers that came first do not keep a run going that has none any more.
+
+    It would converge after 18 evaluations.
+    """
     seen = []
 
     def fails_later(y):
@@ -208,3 +211,19 @@ def test_a_parameter_may_change_nothing_at_the_start_alone():
     hidden = lambda y, args: (y[0] - 3) ** 2 + jnp.where(y[0] > 2, (y[1] - 5) ** 2, 30.0)
     result = sd.minimise(hidden, jnp.ones(2), key=jax.random.key(0))
     np.testing.assert_allclose(result.y, [3, 5], atol=5e-3)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_a_bowl_ends_soon_where_rounding_is_all_that_is_left(n):
+    """There steps fail that are no longer than the rounding of the parameters."""
+    result = sd.minimise(lambda y, args: jnp.sum((y - 3) ** 2), jnp.ones(n), key=jax.random.key(0))
+    assert result.reason == "converged"
+    assert result.evaluations < 25
+
+
+@calls
+def test_a_parameter_that_came_nearer_as_it_failed_goes_no_farther(call):
+    """It changes nothing within 0.05, and fails beyond: one step of the other finds the answer."""
+    fails = lambda y: jnp.where(jnp.abs(y[1]) > 0.05, jnp.nan, y[:1] - 3)
+    result = solved(call, fails, jnp.array([1.0, 0.0]), sigma=1.0)
+    np.testing.assert_allclose(result.y, [3, 0], atol=5e-3)

@@ -4,11 +4,11 @@ $$ \min_{g, H} \|H - H_0\|_F, \qquad g \cdot a_i + \tfrac12 a_i \cdot H a_i = f_
 
 So 2 n + 1 evaluations are enough to begin with; (n + 1)(n + 2) / 2 determine a quadratic.
 
-A function that is none has points that contradict each other: interpolated, those along a line give
-a Hessian that is far too large. So with a number between these two the points need not be met
-exactly: there is a remainder that grows with the distance. With as many as determine a quadratic,
-or with those to both sides of the center alone, it is taken where the evidence says so. Read as the
-mean of a Gaussian process, whose Hessian varies around the last one, a model has one:
+A function that is no quadratic has points that contradict each other: interpolated, those along a
+line give a Hessian that is far too large. So with a number between these two the points need not be
+met exactly: there is a remainder that grows with the distance. With as many as determine a
+quadratic, or with those to both sides of the center alone, it is taken where the evidence says so.
+Read as the mean of a Gaussian process, whose Hessian varies around the last one, a model has one:
 
 $$ -\tfrac12 (m - n - 1) \log r \cdot w - \tfrac12 \log |\det S| $$
 
@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from smoothdiff._products import dot
 from smoothdiff._solvers._history import History
@@ -40,7 +40,7 @@ _RIDGE = {"float32": 1e-7, "float64": 1e-12}
 # what is left of a function that is no quadratic grows as the third power of the distance: this is
 # its variance, against that of the Hessian's entries, where the kernel is about 1
 _REMAINDER = 3e-3
-# the logarithm of the evidence from which on a function is none
+# the logarithm of the evidence from which on a function is no quadratic
 _CLEARLY = 2.0
 
 
@@ -63,6 +63,7 @@ class Quadratic(NamedTuple):
     polynomial: tuple[Float[Array, ""], Float[Array, " n"], Float[Array, "n n"]]
     farthest: Float[Array, ""]
     used: Float[Array, ""]
+    determined: Bool[Array, ""]
     highest: Float[Array, ""]
     away: Float[Array, "m n"]
 
@@ -118,6 +119,8 @@ def least_change(
     sides = jnp.stack([jnp.where(used, left, 0), jnp.eye(len(a), dtype=dtype)[farthest]])
     sides = jnp.pad(sides, ((0, 0), (0, n + 1)))
     count = jnp.sum(used)
+    enough = min(determined_by(n), len(history.valid))
+    unit = jnp.max(jnp.abs(sides[0])) + tiny
 
     def solution(remainder: Array) -> tuple[Array, Array]:
         """Weights of the points, constants and slopes, and the evidence for such a remainder."""
@@ -127,7 +130,7 @@ def least_change(
         solved = jax.scipy.linalg.lu_solve(factor, sides.T)
         # once more for what rounding left, which is much in float32
         solved += jax.scipy.linalg.lu_solve(factor, sides.T - dot(system, solved))
-        changes = jnp.maximum(dot(sides[0], solved[:, 0]), tiny)
+        changes = jnp.maximum(dot(sides[0] / unit, solved[:, 0] / unit), tiny)
         free = jnp.maximum(count - (n + 1), 1).astype(dtype)
         volume = jnp.sum(jnp.log(jnp.abs(jnp.diagonal(factor[0]))))
         finite = jnp.all(jnp.isfinite(solved))
@@ -135,7 +138,7 @@ def least_change(
         return jnp.where(finite, solved.T, 0), jnp.where(finite, evidence, -jnp.inf)
 
     solutions, evidence = jax.vmap(solution)(jnp.asarray([0, _REMAINDER], dtype))
-    between = (count > 2 * n + 1) & (count < determined_by(n))
+    between = (count > 2 * n + 1) & (count < enough)
     inexact = between | (evidence[1] > evidence[0] + _CLEARLY)
     solved = solutions[inexact.astype(jnp.int32)]
     bent = [dot(a.T * weights[None], a) for weights in solved[:, : len(a)]]
@@ -146,6 +149,7 @@ def least_change(
         polynomial=(constants[1], slopes[1], bent[1] / width**2),
         farthest=distance[farthest],
         used=count,
+        determined=count >= enough,
         highest=highest,
         away=jnp.where(used[:, None], away[near], 0),
     )

@@ -27,7 +27,8 @@ class Look(eqx.Module):
     """How many points were `taken`, and whether the look is `done`.
 
     `before` is the lowest value before it, and `follows` the stage that comes next if nothing is
-    lower. `found` counts the looks that found something lower. The run began at the `origin`.
+    lower. `found` counts the looks after which the search began anew. The run began at the
+    `origin`.
     """
 
     origin: Float[Array, " n"]
@@ -73,7 +74,7 @@ class Look(eqx.Module):
         return eqx.tree_at(lambda k: (k.taken, k.done), self, changed)
 
     def again(self) -> "Look":
-        """To come, after one that found something lower."""
+        """To come, in a search that begins anew."""
         changed = jnp.zeros_like(self.done), self.found + 1
         return eqx.tree_at(lambda k: (k.done, k.found), self, changed)
 
@@ -89,7 +90,7 @@ class Look(eqx.Module):
         Without a box they are beyond the best one, as seen from the start.
         """
         at = self.taken + jnp.arange(count, dtype=jnp.int32)
-        times = jnp.exp2(at.astype(best.dtype))[:, None]
+        times = (1 + at).astype(best.dtype)[:, None]
         further = best[None] + times * (best - self.origin)[None]
         if not bounded(params):
             return further

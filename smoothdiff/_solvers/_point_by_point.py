@@ -191,7 +191,8 @@ class PointStep(eqx.Module):
         new_y, after = where(finite, (new_y, after), (self.y, search))
         unknown = jnp.asarray(jnp.nan, theta.dtype)
         seen = Seen(params.layout.tree(point), fun)
-        rest = params.sigma * width, sizes.step, finite, seen, jnp.any(jnp.isinf(funs))
+        overflowed = jnp.any(jnp.isinf(funs) & jnp.all(jnp.isfinite(rows), axis=1))
+        rest = params.sigma * width, sizes.step, finite, seen, overflowed
         progress = progress.after(self.y, unknown, unknown, *rest)
         restarts, found = state.restarts, state.found
         if solver.restarts:

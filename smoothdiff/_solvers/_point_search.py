@@ -33,8 +33,7 @@ class AbstractPointSearch(eqx.Module):
     """Where a search stands: all that was evaluated, and what comes next.
 
     It begins with the `first` points. Where they hardly differ, the `pilot` follows, and the first
-    points again, as far away as it found something else. Within bounds there is a `look` before the
-    end.
+    points again if it found something else. There may be a `look` before the end.
 
     `evaluated` counts the evaluations, `small` the small steps in a row, `stale` the evaluations
     since the last lower point. There is an `average` if the function takes random numbers.
@@ -212,13 +211,13 @@ class AbstractPointSearch(eqx.Module):
         away = jnp.any(jnp.abs(self.history.points - point[None]) > reach[None], axis=1)
         return jnp.any(self.history.valid & (self.history.funs == fun) & away)
 
-    def too_near(self, params: Params) -> Bool[Array, " n"]:
-        """Parameters whose first points change hardly anything, and are nothing beside others."""
+    def too_near(self, steps: Float[Array, " n"]) -> Bool[Array, " n"]:
+        """Parameters whose steps are nothing beside others, and change hardly anything."""
         history = self.history
         alone, here = history.alone(self.start)
         level = hardly_differ(history.rows, history.rows[here])[:, None]
         flat = jnp.any(alone & level, axis=0) & ~jnp.any(alone & ~level, axis=0)
-        return flat & (self.first.reach * params.sigma < _BESIDE * jnp.max(params.sigma))
+        return flat & (steps < _BESIDE * jnp.max(steps))
 
     def piloting(self, params: Params) -> Any:
         """With the pilot next, if the first points are over and all evaluations hardly differ."""
@@ -242,12 +241,14 @@ class AbstractPointSearch(eqx.Module):
     def piloted(self, params: Params, new: History) -> Any:
         """After these points of the pilot: the first points again, or what would have followed."""
         steps = (new.points - self.start[None]) / params.sigma[None]
-        row = self.history.rows[jnp.argmax(self.history.valid)]
-        changed = ~hardly_differ(new.rows, row)
-        pilot = self.pilot.after(steps, changed, new.valid)
+        known, box = jnp.argmax(self.history.valid), has_box(params)
+        changed = ~hardly_differ(new.rows, self.history.rows[known])
+        # in a box they go on until one is lower, whatever the others are
+        found = changed & (~box | (new.valid & (new.funs < self.history.funs[known])))
+        pilot = self.pilot.after(steps, found, new.valid | box)
         stage = jnp.where(pilot.left(params), self.stage, pilot.follows)
         more = eqx.tree_at(lambda s: (s.stage, s.pilot), self, (stage, pilot))
-        width = jnp.where(has_box(params), 1, pilot.length)
+        width = jnp.where(box, 1, pilot.length)
         widened = more.widened(params, self.iterate(), width)
         return where(pilot.length > 0, widened, more)
 

@@ -2,9 +2,10 @@ r"""Newton steps within a trust region, one evaluation a step: while a quadratic
 
 Around the best point the function is modelled as $f + g \cdot u + \tfrac12 u \cdot H u$, in the
 coordinates u in which the Hessian is round, as far as it is known: a narrow valley is as easy as a
-bowl. They follow the Hessian of a model whose points determine it, or that was right where it was
-checked: of fewer points a Hessian is a guess, and widths that follow a guess make the next one
-worse. After a short step comes a point that checks the model, see there.
+bowl. They follow the Hessian of a model whose points determine it, that was right where it was
+checked, or that promises nothing within the radius, so that flat directions widen. Of fewer points
+a Hessian is a guess, and widths that follow a guess make the next one worse. After a short step
+comes a point that checks the model, see there.
 
 Source: the metric is our own.
 """
@@ -21,7 +22,7 @@ from smoothdiff._products import dot
 from smoothdiff._solvers._base import all_finite
 from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._history import History
-from smoothdiff._solvers._least_change import determined_by, least_change
+from smoothdiff._solvers._least_change import least_change
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._model_check import check_step, is_right
 from smoothdiff._solvers._point_search import nothing, powers_of_two
@@ -167,9 +168,8 @@ class QuadraticTrust(eqx.Module):
         steps = steps.at[0].set(first)
         reduction = reduction.at[0].set(jnp.where(which > 0, 0, reduction[0]))
         poor = (model.farthest > _FAR * self.radius) & (model.used > len(center) + 1)
-        determined = model.used >= determined_by(len(center))
         lost = lost_in_rounding(self.metric.out(steps[0]), center)
-        said = asked.tight, determined, lost
+        said = asked.tight, model.determined, lost
         return Proposal(steps, reduction, hessian, poor, check, rise, *said)
 
     def _within_bounds(

@@ -125,7 +125,7 @@ def _unit(values: Float[Array, " m"], valid: Bool[Array, " m"]) -> Float[Array, 
     lowest = jnp.min(jnp.where(valid, values, jnp.inf))
     typical = jnp.nanmedian(jnp.where(valid, values - lowest, jnp.nan))
     limit = float(jnp.finfo(values.dtype).max) ** _EXTREME
-    extreme = jnp.isfinite(typical) & (typical > 0)
+    extreme = jnp.isfinite(typical) & (typical >= jnp.finfo(values.dtype).tiny)
     extreme &= (typical > limit) | (typical < 1 / limit)
     return jnp.where(extreme, typical, jnp.ones_like(typical))
 

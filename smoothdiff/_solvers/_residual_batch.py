@@ -33,7 +33,8 @@ class ResidualBatch(eqx.Module):
         """Rows whose squares are not finite become zeros. Usually all are drawn."""
         there = jnp.arange(len(rows)) < count
         squares = jnp.sum(rows**2, axis=1)
-        good, overflowed = there & jnp.isfinite(squares), jnp.any(there & jnp.isinf(squares))
+        good, overflowed = there & jnp.isfinite(squares), there & jnp.isinf(squares)
+        overflowed = jnp.any(overflowed & jnp.all(jnp.isfinite(rows), axis=1))
         drawn = there if drawn is None else there & drawn
         rows = jnp.where(good[:, None], rows, 0)
         return ResidualBatch(points, rows, good, drawn, count, overflowed)

@@ -221,7 +221,7 @@ class ResidualSearch(AbstractPointSearch):
 
     def _after_first(self, params: Params, funs: Float[Array, " K"]) -> "ResidualSearch":
         first = self.first.after(funs)
-        too_near = self.too_near(params)
+        too_near = self.too_near(params.sigma)
         first = where(first.done() & jnp.any(too_near), first.again(too_near, FARTHER), first)
         stage = jnp.where(first.done(), TRUST, FIRST).astype(self.stage.dtype)
         known = eqx.tree_at(lambda s: (s.stage, s.first), self, (stage, first))

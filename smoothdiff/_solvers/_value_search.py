@@ -114,9 +114,9 @@ class ValueSearch(ValueState):
             full = lambda: more._stepped(params, sizes)._turned(params, sizes)
             return jax.lax.cond(taken >= sizes.first, full, lambda: more)
 
-        branches = [first, local, wide, lambda: known.piloted(params, new)]
         # neither model's turn
         apart = dataclasses.replace(known, turn=self.turn)
+        branches = [first, local, wide, lambda: apart.piloted(params, new)]
         if self.look is not None:
             branches.append(lambda: apart.after_look(params, sizes.step))
         if (scan := self.scan) is not None:

@@ -156,7 +156,7 @@ class ValueState(AbstractPointSearch):
         told = jnp.any(alone & valid, axis=0)
         failed = jnp.any(alone & ~valid & recent[:, None], axis=0) & ~told
         failed &= self.first.reach > _NEAREST
-        near = self.too_near(params) & ~failed
+        near = self.too_near(self.first.reach * params.sigma) & ~failed
         again = self.first.again(failed | near, jnp.where(near, FARTHER, NEARER))
         # where the start has no value, from a point that has one
         best, _, fun = history.best(self.start)
@@ -180,7 +180,7 @@ class ValueState(AbstractPointSearch):
         return dataclasses.replace(anew, **{name: getattr(self, name) for name in names})
 
     def may_run_off(self, params: Params) -> Bool[Array, ""]:
-        """Residuals cannot, as no square is below zero."""
+        """A search for one number may."""
         if (look := self.look) is None:
             return jnp.asarray(False)
         return self.converged() & look.is_far(params, self.history.best(self.start)[0])

@@ -37,7 +37,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     With fewer than 100 parameters the function is evaluated point by point. The first points are
     the start, and one sigma from it to both sides along each parameter. Where they hardly differ,
     pairs of points follow, each four times as far away, up to a thousand sigma, or within finite
-    bounds points anywhere, and then the first points again where these found a change. Then two
+    bounds points anywhere, and then the first points again if these found a change. Then two
     models take turns, and the one that lowers the function faster goes on:
 
     - a local one, around the best point. It interpolates the nearest evaluations, and its Hessian
@@ -57,7 +57,8 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
 
     With `nonfinite="drop"`, where both first points of a parameter fail, nearer ones follow, and so
     they do after a round of samples that all fail. A parameter whose first points had the value of
-    the start keeps no run going. In the end it is back at the start, if that raises nothing.
+    the start, and whose sigma is below a thousandth of the largest, has farther ones. Else it keeps
+    no run going. In the end it is back at the start, if that raises nothing.
 
     M, the metric of both, takes the shape of the Hessian, directions included up to 64 parameters.
     So sigma says where to begin.
@@ -67,9 +68,9 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
 
     Within finite bounds a search that would end looks at 2n + 1 points spread over all of the box.
     Where one is lower, it begins anew. A value that is not finite ends nothing there. Searches that
-    `restarts` add do not look. Where there is no box and it ends more than 1e5 sigma from the
-    start, it begins anew there once, as wide as the way that it came, and each time looks at one
-    point twice as far away: a function that falls for ever has no minimum.
+    `restarts` add do not look. Where there is no box and it has converged more than 1e5 sigma
+    from the start, it begins anew there once, half as wide as it came far, and looks at one point
+    twice as far away each time: a function that falls for ever has no minimum.
 
     Bounds are never left. A sample beyond them is clamped or, where that would throw it out of a
     narrow valley, pulled back along its ray, and the models take it where it was evaluated.
