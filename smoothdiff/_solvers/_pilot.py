@@ -5,12 +5,14 @@ Directions are random, both ways along each, four times as far every time, from 
 first points on. Within a box there are more, anywhere in it: pairs would soon be in its corners.
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
-from smoothdiff._solvers._box import has_box
+from smoothdiff._solvers._box import bounded, closed, has_box, spread
 
 # how many pairs, each so many times as far as the one before
 PAIRS, _WIDER = 5, 4.0
@@ -43,6 +45,21 @@ class Pilot(eqx.Module):
         """Whether there are more points to try."""
         most = self.length_in_box(params.theta.size)
         return self.tried < jnp.where(has_box(params), most, 2 * PAIRS)
+
+    def points(
+        self,
+        params: Params,
+        start: Float[Array, " n"],
+        draw: Callable[[int], Float[Array, "k n"]],
+        count: int,
+    ) -> Float[Array, "K n"]:
+        """The next points: anywhere in a box, else pairs around the start."""
+        pairs = start[None] + params.sigma[None] * self.steps(draw(PAIRS), count)
+        if not bounded(params):
+            return pairs
+        at = self.tried + jnp.arange(count, dtype=jnp.int32)
+        z = draw(self.length_in_box(len(start)))
+        return jnp.where(closed(params), spread(params, z, at), pairs)
 
     def steps(self, z: Float[Array, "k n"], count: int) -> Float[Array, "K n"]:
         """The next points, in units of sigma, along these directions."""

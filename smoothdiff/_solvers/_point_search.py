@@ -11,11 +11,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
 from smoothdiff._solvers._averaging import Average
-from smoothdiff._solvers._box import bounded, closed, has_box, spread
+from smoothdiff._solvers._box import has_box
 from smoothdiff._solvers._first_points import FirstPoints
 from smoothdiff._solvers._history import History, hardly_differ
 from smoothdiff._solvers._look import Look
-from smoothdiff._solvers._pilot import PAIRS, Pilot
+from smoothdiff._solvers._pilot import Pilot
 from smoothdiff._solvers._ratio_test import is_lower
 from smoothdiff._solvers._stages import FIRST, LOOK, PILOT, TRUST, Sizes, where
 
@@ -226,17 +226,6 @@ class AbstractPointSearch(eqx.Module):
         stage = jnp.full_like(self.stage, PILOT)
         flat = eqx.tree_at(lambda s: (s.stage, s.pilot.follows), self, (stage, self.stage))
         return where(same & (self.stage != FIRST) & self.pilot.left(params), flat, self)
-
-    def pilot_points(
-        self, params: Params, draw: Callable[[int], Float[Array, "k n"]], count: int
-    ) -> Float[Array, "K n"]:
-        """The next points of the pilot."""
-        pairs = self.start[None] + params.sigma[None] * self.pilot.steps(draw(PAIRS), count)
-        if not bounded(params):
-            return pairs
-        at = self.pilot.tried + jnp.arange(count, dtype=jnp.int32)
-        z = draw(self.pilot.length_in_box(len(self.start)))
-        return jnp.where(closed(params), spread(params, z, at), pairs)
 
     def piloted(self, params: Params, new: History) -> Any:
         """After these points of the pilot: the first points again, or what would have followed."""

@@ -178,7 +178,7 @@ class ResidualSearch(AbstractPointSearch):
             points = jnp.where(((at == 1) & worth)[:, None], end[None], points)
             return jnp.where((at == 0)[:, None], wide.center[None], points), nothing
 
-        pilot = lambda: (self.pilot_points(params, draw, count), nothing)
+        pilot = lambda: (self.pilot.points(params, self.start, draw, count), nothing)
         branches = [first, local, wide, pilot]
         if (look := self.look) is not None:
             best = self.history.best(self.start)[0]

@@ -65,7 +65,7 @@ class ValueSearch(ValueState):
             best, *_ = self.history.best(self.start)
             return points.at[0].set(jnp.where(self.checks_noise(), best, points[0])), nothing
 
-        further = lambda: (self.pilot_points(params, draw, count), nothing)
+        further = lambda: (self.pilot.points(params, self.start, draw, count), nothing)
         branches = [first, local, wide, further]
         if (look := self.look) is not None:
             best = self.history.best(self.start)[0]
