@@ -121,16 +121,16 @@ def test_bounds_hold():
 
 @pytest.mark.parametrize("residuals", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_a_needle_in_a_box_is_found(residuals):
-    """One of 67 points is on it; the start is on the plateau around it."""
+    """One of 16 points is on it; the start is on the plateau around it."""
     found = 0
     for seed in range(4):
-        needle = jax.random.uniform(jax.random.key(seed), (4,), minval=0.2, maxval=0.8)
+        needle = jax.random.uniform(jax.random.key(seed), (4,), minval=0.3, maxval=0.7)
 
         def rows(y, args, needle=needle):
             away = y - needle
             # beside it is a hill, and some of the box fails
             around = jnp.where(y[0] > 0.9, 1.2, jnp.where(y[1] > 0.95, jnp.nan, 1.0))
-            return jnp.where(jnp.max(jnp.abs(away)) < 0.175, away, around)
+            return jnp.where(jnp.max(jnp.abs(away)) < 0.25, away, around)
 
         def fun(y, args, rows=rows):
             return jnp.sum(rows(y, args) ** 2) / 2
@@ -138,7 +138,7 @@ def test_a_needle_in_a_box_is_found(residuals):
         call, of = (sd.least_squares, rows) if residuals else (sd.minimise, fun)
         settings = {"key": jax.random.key(seed), "bounds": (0.0, 1.0), "max_evaluations": 200}
         found += call(of, jnp.full(4, 0.05), **settings).fun < 0.1
-    assert found >= 3
+    assert found == 4
 
 
 @pytest.mark.slow

@@ -34,7 +34,8 @@ _FAR = 2.0
 # and one, without a lower point for good
 _FAILS, _SLOW = 5, 10
 # while far points make way for nearer ones, so many failures shrink the radius; none where it is
-# no more than that: there the points, and not the radius, are to blame
+# no more than that: there the points, and not the radius, are to blame, unless the value is the
+# same, as on stairs
 _PATIENCE, _NEAR = 2, 0.5
 
 
@@ -218,7 +219,7 @@ class QuadraticTrust(eqx.Module):
         # in the units that the step was made in
         moved = jnp.linalg.norm(proposal.steps[best])
         # a model of far points is made better before it is trusted less
-        patient = (fails < _PATIENCE) | (self.radius <= _NEAR)
+        patient = (fails < _PATIENCE) | ((self.radius <= _NEAR) & (fun != before))
         wait = proposal.poor & patient & ~long
         fails = jnp.where(wait, jnp.minimum(fails, _PATIENCE), fails)
         lower = jnp.minimum(self.radius, length) * jnp.where(long, 0.1, 0.5)
