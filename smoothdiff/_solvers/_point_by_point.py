@@ -152,9 +152,9 @@ class PointStep(eqx.Module):
             # parameters in one array may have very different units
             scale = jnp.maximum(jnp.abs(params.theta), params.sigma)
             rounding = math.sqrt(jnp.finfo(theta.dtype).eps) * scale
-            # a model of residuals is not checked: it has not converged while the loss falls
+            # it has not converged while the function falls by more than rounding
             falls = progress.lowest_fun - fun > taken_by_rounding(progress.lowest_fun)
-            least_move = jnp.where(falls & solver.squares, 0, rounding)
+            least_move = jnp.where(falls, 0, rounding)
             tolerance = jnp.maximum(solver.atol + solver.rtol * scale, least_move)
             tiny = jnp.finfo(theta.dtype).tiny
             # of steps at several radii the first is that of the model
