@@ -1,5 +1,7 @@
 """The box of parameters that have bounds to both sides, and places in it."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -36,11 +38,26 @@ def has_box(params: Params) -> Bool[Array, ""]:
     return closed(params) if bounded(params) else jnp.asarray(False)
 
 
-def spread(params: Params, z: Float[Array, "k n"], at: Int[Array, " K"]) -> Float[Array, "K n"]:
-    """Points spread over the box as these normal ones, those `at`, are over space."""
+def over_box(
+    params: Params,
+    draw: Callable[[], Float[Array, "k n"]],
+    at: Int[Array, " K"],
+    otherwise: Float[Array, "K n"],
+) -> Float[Array, "K n"]:
+    """Points spread over the box as normal ones are over space; without a box the others.
+
+    Args:
+        params: the bounds.
+        draw: makes samples that are standard normal, not called without bounds.
+        at: which of them are taken.
+        otherwise: as many other points.
+    """
+    if not bounded(params):
+        return otherwise
     low, high = bounds_of(params)
+    z = draw()
     share = jax.scipy.special.ndtr(z)[jnp.minimum(at, len(z) - 1)]
-    return low[None] + share * (high - low)[None]
+    return jnp.where(closed(params), low[None] + share * (high - low)[None], otherwise)
 
 
 def anywhere(params: Params, key: Array, lowest: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -29,7 +29,7 @@ from smoothdiff._products import dot
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._metric import Metric
 
-# the most evaluations that are interpolated, if n parameters do not need more
+# the most evaluations that are interpolated
 _MOST = 256
 # how far they may be, in radii of the region or of the nearest 2 n + 1 of them
 _FARTHEST = 3.0
@@ -44,17 +44,13 @@ _REMAINDER = 3e-3
 _CLEARLY = 2.0
 
 
-def determined_by(n: int) -> int:
-    """So many evaluations determine a quadratic, as far as a model takes as many."""
-    return min((n + 1) * (n + 2) // 2, _MOST)
-
-
 class Quadratic(NamedTuple):
     """The gradient and the Hessian at the center, in units of the metric.
 
     So many points are `used`, and one of them has the value that is `highest` above the center's.
-    `away` are their places, seen from the center; those of other points are zero. The farthest is
-    at the distance `farthest`. The `polynomial`, a constant, a slope and a bend, is 1 there and 0
+    It is `determined` by them, or they are as many as a model takes. `away` are their places, seen
+    from the center; those of other points are zero. The farthest is at the distance `farthest`. The
+    `polynomial`, a constant, a slope and a bend, is 1 there and 0
     at the others, as far as they are interpolated.
     """
 
@@ -94,8 +90,9 @@ def least_change(
     again = history.valid & (length == 0) & (history.funs == fun)
     again &= jnp.arange(len(away)) != jnp.argmax(again)
     everywhere = jnp.where(history.valid & ~again, length, jnp.inf)
-    most = max(determined_by(n), 2 * n + 1)
-    nearest, near = jax.lax.top_k(-jnp.asarray(everywhere), min(most, len(away)))
+    # as many as determine a quadratic, as far as a model takes them
+    enough = min((n + 1) * (n + 2) // 2, _MOST, len(away))
+    nearest, near = jax.lax.top_k(-jnp.asarray(everywhere), enough)
     distance = -jnp.asarray(nearest)
     close = distance[: 2 * n + 1]
     spread = jnp.max(jnp.where(jnp.isfinite(close), close, 0))
@@ -119,7 +116,6 @@ def least_change(
     sides = jnp.stack([jnp.where(used, left, 0), jnp.eye(len(a), dtype=dtype)[farthest]])
     sides = jnp.pad(sides, ((0, 0), (0, n + 1)))
     count = jnp.sum(used)
-    enough = min(determined_by(n), len(history.valid))
     unit = jnp.max(jnp.abs(sides[0])) + tiny
 
     def solution(remainder: Array) -> tuple[Array, Array]:

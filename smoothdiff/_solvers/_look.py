@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
-from smoothdiff._solvers._box import bounded, closed, has_box, spread
+from smoothdiff._solvers._box import has_box, over_box
 
 # the seeds of the samples of a search are so many: each look and each search after one has others
 _SEEDS = 2**16
@@ -92,10 +92,7 @@ class Look(eqx.Module):
         at = self.taken + jnp.arange(count, dtype=jnp.int32)
         times = (1 + at).astype(best.dtype)[:, None]
         further = best[None] + times * (best - self.origin)[None]
-        if not bounded(params):
-            return further
-        z = draw(self.length(len(best)))
-        return jnp.where(closed(params), spread(params, z, at), further)
+        return over_box(params, lambda: draw(self.length(len(best))), at, further)
 
     def seed(self, looking: Bool[Array, ""]) -> Int[Array, ""]:
         """What is added to those of a search's samples."""

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
-from smoothdiff._solvers._box import bounded, closed, has_box, spread
+from smoothdiff._solvers._box import has_box, over_box
 
 # how many pairs, each so many times as far as the one before
 PAIRS, _WIDER = 5, 4.0
@@ -55,11 +55,8 @@ class Pilot(eqx.Module):
     ) -> Float[Array, "K n"]:
         """The next points: anywhere in a box, else pairs around the start."""
         pairs = start[None] + params.sigma[None] * self.steps(draw(PAIRS), count)
-        if not bounded(params):
-            return pairs
         at = self.tried + jnp.arange(count, dtype=jnp.int32)
-        z = draw(self.length_in_box(len(start)))
-        return jnp.where(closed(params), spread(params, z, at), pairs)
+        return over_box(params, lambda: draw(self.length_in_box(len(start))), at, pairs)
 
     def steps(self, z: Float[Array, "k n"], count: int) -> Float[Array, "K n"]:
         """The next points, in units of sigma, along these directions."""

@@ -197,16 +197,14 @@ class QuadraticTrust(eqx.Module):
         """The region after these values came; its metric follows a Hessian that can be trusted."""
         funs = jnp.where(good, funs, jnp.inf)
         best = jnp.argmin(funs)
-        fun, reduction = funs[best], proposal.reduction[best]
+        # what rounding may do says nothing against the model
+        fun, reduction = funs[best], jnp.where(proposal.lost, 0, proposal.reduction[best])
         hessian = proposal.hessian
         metric, turn = self.metric.adapted(
             lambda v: dot(hessian, v), jnp.diagonal(hessian), jnp.zeros_like(fun)
         )
         outcome = ratio_test(before, fun, reduction, self.fails)
-        # what rounding may do says nothing against the model
-        more = outcome.more & ~proposal.lost
-        fails = jnp.where(proposal.lost, self.fails, outcome.fails)
-        failed, held, long = outcome.failed & ~proposal.lost, outcome.held, outcome.long
+        _, failed, held, long, fails, _ = outcome
         # a check is no step, but a model that is right about it may have converged
         right = proposal.check & is_right(before, funs[0], proposal.rise)
         usable = all_finite((metric, turn)) & (right | proposal.tight | proposal.determined)
@@ -226,7 +224,6 @@ class QuadraticTrust(eqx.Module):
         radius = jnp.where(failed & ~wait, lower, self.radius)
         radius = jnp.where(held, jnp.maximum(radius, 2 * length), radius)
         radius = jnp.where(proposal.tight & ~self.teaches(), 2 * self.radius, radius)
-        outcome = outcome._replace(more=more)
         ends = settled(self.settled | proposal.lost, outcome, moved, radii[best])
         return QuadraticTrust(
             metric=metric,
