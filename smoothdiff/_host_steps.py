@@ -6,107 +6,22 @@ and only for those stages that a run comes to.
 
 import dataclasses
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from smoothdiff._call_checks import check_squares
 from smoothdiff._flat import Flat
-from smoothdiff._host_function import evaluator, rows_at, traced
-from smoothdiff._problem import Problem, Trial
-from smoothdiff._programs import QUICKLY, is_short
+from smoothdiff._programs import QUICKLY
 from smoothdiff._solvers._base import smoothed_params
-from smoothdiff._solvers._evaluator import Evaluator
-from smoothdiff._solvers._judgement import Values, differ
 from smoothdiff._solvers._point_by_point import PointState, PointStep
-from smoothdiff._solvers._random_numbers import in_round, takes_key
 from smoothdiff._solvers._stages import Sizes
 
 # with a history of fewer numbers a step is short, and compiling it well would take longer than all
 # of the steps
 _SHORT = 1_000_000
-
-
-class HostProblem(Problem):
-    """A problem whose solver steps point by point."""
-
-    host: "HostSteps"
-    quick: bool = eqx.field(static=True, default=False)
-
-    @staticmethod
-    def of(
-        fun: Callable, solver: Any, args: PyTree, options: dict[str, Any], y: PyTree
-    ) -> "HostProblem":
-        """For parameters like `y`, once the values of the solver were looked at."""
-        return HostProblem(fun, solver, args, options, HostSteps.of(solver, options, y))
-
-    def begin(self, y: PyTree, check: Callable[[PyTree], None]) -> tuple["HostProblem", PointState]:
-        """As for any problem, compiled for shapes; and with how well to compile the function."""
-        program, out = traced(self.fun, y, self.args)
-        check(out)
-        quick = is_short(program, self.host.sizes.step)
-        return dataclasses.replace(self, quick=quick), self.host.init(y, out)
-
-    def stage(self, state: PointState) -> int:
-        """That of the search."""
-        return int(state.search.stage)
-
-    def step(self, y: PyTree, state: PointState) -> tuple[PyTree, PointState, Bool[Array, ""]]:
-        """The next evaluations, between what is compiled for the stage of the search."""
-        points, proposal = self.host.propose(y, state)
-        args = self.args
-        if takes_key(self.options):
-            args = self.host.parts(y, state).numbers(args)
-        rows = rows_at(_evaluator(self, args, y), points, len(points), self.quick)
-        if self.solver.squares and state.progress.step == 0:
-            check_squares(np.asarray(rows[0]))
-        return self.host.told(y, state, points, rows, proposal)
-
-    def done(self, y: PyTree, state: PointState) -> Bool[Array, ""]:
-        """Whether the solver wants to stop before a step, compiled for shapes."""
-        return _done(self.host.parts(y, state))
-
-    def spare(self, y: PyTree, state: PointState) -> int:
-        """Of the evaluations for the judgement, those that a function without noise leaves."""
-        if takes_key(self.options):
-            return 0
-        start = state.search.start
-        others = len(state.search.candidates(start, start))
-        return self.solver.final_evaluations(y) - 2 - others
-
-    def trial(self, y: PyTree, state: PointState) -> Trial:
-        """The lowest point once more."""
-        point, fun = state.progress.lowest_y, state.progress.lowest_fun
-        points = jax.tree.map(lambda a: a[None], point)
-        again = self._values(y).at(points, jnp.asarray(0, jnp.int32))
-        return Trial(again, bool(~jnp.isfinite(fun) | differ(again[0], fun)))
-
-    def judge(
-        self, y: PyTree, state: PointState, trial: Trial | None = None
-    ) -> tuple[PyTree, dict[str, Any]]:
-        """Decided on the host, so that nothing is compiled for it."""
-        values, parts = self._values(y), self.host.parts(y, state)
-        if trial is None:
-            return parts.judge(values, _loop)
-        if trial.noisy:
-            return parts.judge(values._replace(at=partial(_known_last, values.at, trial)), _loop)
-        y, stats = parts.judge(values, _once)
-        return y, stats | {"evaluations": stats["evaluations"] + 1}
-
-    def _values(self, y: PyTree) -> Values:
-        def at(points: PyTree[Array], number: Array) -> Array:
-            args = in_round(self.args, self.options, number)
-            evaluate = _evaluator(self, args, y)
-            vectors = jax.vmap(lambda y: evaluate.layout.vector(jax.tree.leaves(y)))(points)
-            rows = rows_at(evaluate, vectors, self.host.sizes.step, self.quick)
-            return evaluate.funs(rows)
-
-        return Values(at, takes_key(self.options))
 
 
 class HostSteps(eqx.Module):
@@ -178,12 +93,6 @@ class HostSteps(eqx.Module):
 # functions, as a call of a method makes a module, which takes a tenth of a millisecond
 
 
-def _evaluator(problem: HostProblem, args: PyTree, y: PyTree) -> Evaluator:
-    solver = problem.solver
-    parts = (getattr(solver, name, None) for name in ("batch_size", "sharding"))
-    return evaluator(problem.fun, solver.squares, args, y, *parts)
-
-
 def _sizes(steps: HostSteps, count: int | None) -> Sizes:
     return steps.sizes if count is None else steps.sizes._replace(step=count)
 
@@ -197,11 +106,6 @@ def _first_state(solver: Any, options: dict[str, Any], y: PyTree[Array], out: Py
     state = solver.init(None, y, None, options, out, None, frozenset())
     # weak types would compile the second step anew
     return jax.tree.map(lambda a: jnp.asarray(a, a.dtype), state)
-
-
-@eqx.filter_jit
-def _done(step: PointStep) -> Bool[Array, ""]:
-    return step.over()
 
 
 @eqx.filter_jit
@@ -250,24 +154,3 @@ def _compiled(state: PointState) -> list[Callable]:
     """The parts for a history of this size."""
     short = state.search.history.rows.size < _SHORT
     return _QUICKLY if short and jax.default_backend() == "cpu" else _WELL
-
-
-def _loop(more: Callable, body: Callable, state: Any) -> Any:
-    """`jax.lax.while_loop` on the host."""
-    while more(state):
-        state = body(state)
-    return state
-
-
-def _once(more: Callable, body: Callable, state: Any) -> Any:
-    """The same where one round is enough."""
-    return body(state)
-
-
-def _known_last(at: Callable, trial: Trial, points: PyTree[Array], number: Array) -> Array:
-    """The values `at` these points; in the first round that of the last one is known."""
-    if number > 0:
-        return at(points, number)
-    rest = jax.tree.map(lambda a: a[:-1], points)
-    more = len(jax.tree.leaves(rest)[0]) > 0
-    return jnp.concatenate([*([at(rest, number)] if more else []), trial.fun])

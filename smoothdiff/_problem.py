@@ -13,10 +13,11 @@ from smoothdiff._solvers._evaluator import called
 
 
 class Trial(NamedTuple):
-    """The function at the lowest point once more, and whether it is another value."""
+    """The function at the lowest point once more, whether it is another value, and what it took."""
 
     fun: Float[Array, " 1"]
     noisy: bool
+    evaluations: int
 
 
 class Problem(eqx.Module):
@@ -45,6 +46,10 @@ class Problem(eqx.Module):
         state = self.solver.init(self._fn, y, self.args, self.options, out, None, frozenset())
         # weak types would compile the second step anew
         return self, jax.tree.map(lambda a: jnp.asarray(a, a.dtype), state)
+
+    def reason(self, state: Any) -> str:
+        """One word for why it stops here, where `done` said so."""
+        return self.solver.reason(state)
 
     def stage(self, state: Any) -> int:
         """Which of the steps comes next that are compiled each by itself."""

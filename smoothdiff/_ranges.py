@@ -130,6 +130,10 @@ class Integer(AbstractSpace):
     Each of the n numbers has an interval of the same width 1 / n, the ends too, and the unit
     coordinate of a number is the middle of its interval.
 
+    If all parameters are whole numbers, with fewer than 100 of them, `minimise` and `least_squares`
+    evaluate a function without noise once at each point, and end where it is known at all. Two
+    points, evaluated twice, show that there is no noise.
+
     Args:
         low: the least number, or one for each number of the parameter.
         high: the largest number, itself included, likewise.
@@ -163,32 +167,33 @@ class Integer(AbstractSpace):
         y = jnp.asarray(y)
         # differences of integers are exact, whatever the size of the numbers
         y = y if jnp.issubdtype(y.dtype, jnp.floating) else y.astype(int)
-        last = fit(self._count() - 1, y)
+        last = fit(self.count() - 1, y)
         index = floating(jnp.clip(y - fit(self.low, y), 0, last))
-        return (index + 0.5) / fit(self._count(), index)
+        return (index + 0.5) / fit(self.count(), index)
 
     def to_natural(self, u: ArrayLike) -> Array:
         """The number in whose interval a unit coordinate lies, in JAX's default integer dtype."""
         u = floating(u)
-        count = fit(self._count(), u)
+        count = fit(self.count(), u)
         index = jnp.clip(jnp.floor(u * count), 0, count - 1).astype(int)
         return fit(self.low, index) + index
 
     def to_axis(self, u: ArrayLike) -> Array:
         """Where plots show a unit coordinate: the intervals of the numbers around them."""
         u = floating(u)
-        return fit(self.low, u) - 0.5 + u * fit(self._count(), u)
+        return fit(self.low, u) - 0.5 + u * fit(self.count(), u)
 
     @property
     def unit_bounds(self) -> tuple[float, float]:
         """Zero and one."""
         return 0.0, 1.0
 
-    def _count(self) -> np.ndarray:
+    def count(self) -> np.ndarray:
+        """How many numbers there are."""
         return np.asarray(np.subtract(self.high, self.low) + 1)
 
     def _default_width(self, share: float) -> Any:
-        return np.maximum(share, 0.5 / self._count())
+        return np.maximum(share, 0.5 / self.count())
 
     def _check_dtype(self, dtype: np.dtype, name: str) -> None:
         super()._check_dtype(dtype, name)
@@ -198,7 +203,7 @@ class Integer(AbstractSpace):
         most = min(np.iinfo(seen).max, np.iinfo(default).max)
         unit = floating(np.zeros(0, dtype)).dtype
         # with more, the middles of intervals round to their edges
-        distinct = np.all(self._count() <= 2 ** (jnp.finfo(unit).nmant - 1))
+        distinct = np.all(self.count() <= 2 ** (jnp.finfo(unit).nmant - 1))
         if np.any(np.less(self.low, least)) or np.any(np.greater(self.high, most)) or not distinct:
             raise ValueError(
                 f"the whole numbers [{self.low}, {self.high}] of the parameter{name} are too many "

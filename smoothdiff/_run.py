@@ -150,7 +150,7 @@ class Run:
         """Why the solver wants to stop, if it does."""
         if self.stopped is None:
             self.stopped = self.problem.done(self.y, self.state)
-        return self.problem.solver.reason(self.state) if self.stopped else None
+        return self.problem.reason(self.state) if self.stopped else None
 
     def step(self) -> Record:
         """Takes a step and keeps it, unless it failed."""

@@ -14,8 +14,9 @@ from tqdm import tqdm
 from smoothdiff._black_box import UnknownOutputError
 from smoothdiff._call_checks import check_call, check_solver, explained
 from smoothdiff._default_solver import default_solver, share_of_range
+from smoothdiff._host_problem import HostProblem
 from smoothdiff._host_samples import BlackBoxError
-from smoothdiff._host_steps import HostProblem
+from smoothdiff._known import Known
 from smoothdiff._limits import Limits
 from smoothdiff._problem import Problem
 from smoothdiff._result import Record, Result
@@ -100,7 +101,8 @@ def solve(
         if solver.sizes(y) is None:
             problem = Problem(fun, solver, args, options)
         else:
-            problem = HostProblem.of(fun, solver, args, options, y)
+            known = None if takes_key else Known.of(units)
+            problem = HostProblem.of(fun, solver, args, options, y, known)
         problem, state = _begun(problem, y, kind.check)
     run = Run(problem, y, state, units, _keeps(loop.keep_iterates, y))
     try:

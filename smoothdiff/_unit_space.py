@@ -1,6 +1,7 @@
 """The parameters of a run in unit coordinates: a pytree of spaces beside its start."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from smoothdiff._ranges import Integer
 from smoothdiff._spaces import SIGMA, AbstractSpace, floating
 
 _LEAF = jax.tree.structure(0)
@@ -92,6 +94,15 @@ class UnitSpace:
             return None
         low, high = zip(*ends, strict=True)
         return self.treedef.unflatten(low), self.treedef.unflatten(high)
+
+    def count(self) -> int | None:
+        """How many points there are, if all parameters are whole numbers."""
+        counts = []
+        for space, shape in zip(self.spaces, self.shapes, strict=True):
+            if not isinstance(space, Integer):
+                return None
+            counts += np.broadcast_to(space.count(), shape).reshape(-1).tolist()
+        return math.prod(counts)
 
     def sigma(self, share: float = SIGMA) -> PyTree:
         """The smoothing width in unit coordinates, None where there is no space to say it.

@@ -20,7 +20,7 @@ _REPEATS = 3
 # so many standard errors lower is clearly lower
 _CLEARLY = 3.0
 # what rounding may do to a value that another program computes again, in units of its own
-_ROUNDING = 64
+ROUNDING = 64
 
 
 class Values(NamedTuple):
@@ -184,5 +184,5 @@ def _rounds(count: int, each: int) -> int:
 
 def differ(again: Float[Array, ""], before: Float[Array, ""]) -> Bool[Array, ""]:
     """Whether a value that was computed twice differs by more than rounding."""
-    eps = _ROUNDING * jnp.finfo(before.dtype).eps
+    eps = ROUNDING * jnp.finfo(before.dtype).eps
     return jnp.isfinite(before) & ~(jnp.abs(again - before) <= eps * jnp.abs(before))

@@ -212,7 +212,7 @@ class PointStep(eqx.Module):
         """The iterate and the state of another search, and the history of the lowest before it."""
         params = self.params()
         lowest_theta = params.layout.vector(jax.tree.leaves(progress.lowest_y))
-        key = jax.random.fold_in(read_options(self.options)[0], progress.evaluations)
+        key = jax.random.fold_in(read_options(self.options)[0], progress.step)
         place, other = jax.random.split(key)
         theta = anywhere(params, place, lowest_theta)
         start = params.layout.vector(jax.tree.leaves(progress.start_y))

@@ -23,6 +23,13 @@ class Sizes(NamedTuple):
     later: int
     patience: int
 
+    @staticmethod
+    def of(at_once: int | None, first: int, later: int, patience: int) -> "Sizes":
+        """For so many evaluations at once, or one; rounds take as many steps as they need."""
+        step = at_once or 1
+        first, later = (-(-count // step) * step for count in (first, later))
+        return Sizes(step, first, later, patience)
+
 
 def where(condition: Bool[Array, ""], a: Any, b: Any) -> Any:
     """One of two pytrees; what is the same in both, such as the history, is not copied."""

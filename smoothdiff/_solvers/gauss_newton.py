@@ -181,13 +181,13 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         n = sum(leaf.size for leaf in jax.tree.leaves(y))
         if n >= _batch_by_batch.MANY or callable(self.sigma):
             return None
-        first = self.num_samples or 4 + int(3 * math.log(n))
+        first = 4 + int(3 * math.log(n))
         # what the history has need not be seen again
-        later = first if self.num_samples else min(first, max(4, n))
+        later = min(first, max(4, n))
         patience = self.patience or max(
             _point_by_point.PATIENCE * (n + 1), 0 if self.restarts else _LAST
         )
-        return Sizes(self.num_samples or 1, first, later, patience)
+        return Sizes.of(self.num_samples, first, later, patience)
 
     def evaluations_per_step(self, y: PyTree[Array]) -> int:
         """One, or `num_samples`; with many parameters a batch and the steps that are tried."""

@@ -163,9 +163,9 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         if n >= _MANY or callable(self.sigma):
             return None
         # about one for each parameter; Sobol points are balanced if they are a power of two
-        count = self.num_samples or 2 ** int(math.log2(min(max(n, _FEW), _SOME)))
+        count = 2 ** int(math.log2(min(max(n, _FEW), _SOME)))
         patience = self.patience or _point_by_point.PATIENCE * (n + 1)
-        return Sizes(self.num_samples or 1, count, count, patience)
+        return Sizes.of(self.num_samples, count, count, patience)
 
     def evaluations_per_step(self, y: PyTree[Array]) -> int:
         """One, or `num_samples`; with many parameters a batch."""

@@ -1,0 +1,166 @@
+"""A problem whose solver steps point by point: its function is called between compiled parts."""
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, PyTree
+
+from smoothdiff._call_checks import check_squares
+from smoothdiff._host_function import evaluator, rows_at, traced
+from smoothdiff._host_steps import HostSteps
+from smoothdiff._known import Known
+from smoothdiff._problem import Problem, Trial
+from smoothdiff._programs import is_short
+from smoothdiff._solvers._evaluator import Evaluator
+from smoothdiff._solvers._judgement import Values, differ
+from smoothdiff._solvers._point_by_point import PointState, PointStep
+from smoothdiff._solvers._random_numbers import in_round, takes_key
+
+
+class HostProblem(Problem):
+    """A problem whose solver steps point by point."""
+
+    host: "HostSteps"
+    known: Known | None
+    quick: bool = eqx.field(static=True, default=False)
+
+    @staticmethod
+    def of(
+        fun: Callable,
+        solver: Any,
+        args: PyTree,
+        options: dict[str, Any],
+        y: PyTree,
+        known: Known | None,
+    ) -> "HostProblem":
+        """For parameters like `y`, once the values of the solver were looked at."""
+        return HostProblem(fun, solver, args, options, HostSteps.of(solver, options, y), known)
+
+    def begin(self, y: PyTree, check: Callable[[PyTree], None]) -> tuple["HostProblem", PointState]:
+        """As for any problem, compiled for shapes; and with how well to compile the function."""
+        program, out = traced(self.fun, y, self.args)
+        check(out)
+        quick = is_short(program, self.host.sizes.step)
+        return dataclasses.replace(self, quick=quick), self.host.init(y, out)
+
+    def stage(self, state: PointState) -> int:
+        """That of the search."""
+        return int(state.search.stage)
+
+    def step(self, y: PyTree, state: PointState) -> tuple[PyTree, PointState, Bool[Array, ""]]:
+        """The next evaluations, between what is compiled for the stage of the search."""
+        points, proposal = self.host.propose(y, state)
+        args = self.args
+        if takes_key(self.options):
+            args = self.host.parts(y, state).numbers(args)
+        before = self._answered()
+        rows = self._rows(_evaluator(self, args, y), points, len(points))
+        if self.solver.squares and state.progress.step == 0:
+            check_squares(np.asarray(rows[0]))
+        y, state, over = self.host.told(y, state, points, rows, proposal)
+        if (answered := self._answered() - before) > 0:
+            count = state.progress.evaluations - answered
+            state = eqx.tree_at(lambda s: s.progress.evaluations, state, count)
+        return y, state, over | self._complete()
+
+    def done(self, y: PyTree, state: PointState) -> Bool[Array, ""]:
+        """Whether the solver wants to stop before a step, compiled for shapes."""
+        return _done(self.host.parts(y, state)) | self._complete()
+
+    def reason(self, state: PointState) -> str:
+        """As the solver, unless all points are known."""
+        return "converged" if self._complete() else super().reason(state)
+
+    def spare(self, y: PyTree, state: PointState) -> int:
+        """Of the evaluations for the judgement, those that a function without noise leaves."""
+        if takes_key(self.options):
+            return 0
+        start = state.search.start
+        others = len(state.search.candidates(start, start))
+        return self.solver.final_evaluations(y) - 2 - others
+
+    def trial(self, y: PyTree, state: PointState) -> Trial:
+        """The lowest point once more."""
+        point, fun = state.progress.lowest_y, state.progress.lowest_fun
+        points = jax.tree.map(lambda a: a[None], point)
+        before = self._answered()
+        again = self._values(y).at(points, jnp.asarray(0, jnp.int32))
+        noisy = bool(~jnp.isfinite(fun) | differ(again[0], fun))
+        return Trial(again, noisy, 1 - (self._answered() - before))
+
+    def judge(
+        self, y: PyTree, state: PointState, trial: Trial | None = None
+    ) -> tuple[PyTree, dict[str, Any]]:
+        """Decided on the host, so that nothing is compiled for it."""
+        values, parts = self._values(y), self.host.parts(y, state)
+        before = self._answered()
+        if trial is None:
+            y, stats = parts.judge(values, _loop)
+        elif trial.noisy:
+            values = values._replace(at=partial(_known_last, values.at, trial))
+            y, stats = parts.judge(values, _loop)
+        else:
+            y, stats = parts.judge(values, _once)
+            before += trial.evaluations
+        return y, stats | {"evaluations": stats["evaluations"] - (self._answered() - before)}
+
+    def _values(self, y: PyTree) -> Values:
+        def at(points: PyTree[Array], number: Array) -> Array:
+            args = in_round(self.args, self.options, number)
+            evaluate = _evaluator(self, args, y)
+            vectors = jax.vmap(lambda y: evaluate.layout.vector(jax.tree.leaves(y)))(points)
+            rows = self._rows(evaluate, vectors, self.host.sizes.step)
+            return evaluate.funs(rows)
+
+        return Values(at, takes_key(self.options))
+
+    def _rows(self, evaluate: Evaluator, points: Array, at_once: int) -> Array:
+        """What the function returns at points, so many at once, unless it is known."""
+        fresh = lambda points: rows_at(evaluate, points, at_once, self.quick)
+        if self.known is None:
+            return fresh(points)
+        return self.known.rows(points, evaluate.layout, fresh)
+
+    def _answered(self) -> int:
+        return 0 if self.known is None else self.known.answered
+
+    def _complete(self) -> bool:
+        return self.known is not None and self.known.complete
+
+
+def _evaluator(problem: HostProblem, args: PyTree, y: PyTree) -> Evaluator:
+    solver = problem.solver
+    parts = (getattr(solver, name, None) for name in ("batch_size", "sharding"))
+    return evaluator(problem.fun, solver.squares, args, y, *parts)
+
+
+@eqx.filter_jit
+def _done(step: PointStep) -> Bool[Array, ""]:
+    return step.over()
+
+
+def _loop(more: Callable, body: Callable, state: Any) -> Any:
+    """`jax.lax.while_loop` on the host."""
+    while more(state):
+        state = body(state)
+    return state
+
+
+def _once(more: Callable, body: Callable, state: Any) -> Any:
+    """The same where one round is enough."""
+    return body(state)
+
+
+def _known_last(at: Callable, trial: Trial, points: PyTree[Array], number: Array) -> Array:
+    """The values `at` these points; in the first round that of the last one is known."""
+    if number > 0:
+        return at(points, number)
+    rest = jax.tree.map(lambda a: a[:-1], points)
+    more = len(jax.tree.leaves(rest)[0]) > 0
+    return jnp.concatenate([*([at(rest, number)] if more else []), trial.fun])
