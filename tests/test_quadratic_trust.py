@@ -47,7 +47,8 @@ REVISE = eqx.filter_jit(QuadraticTrust.revise)
 def propose(trust, history, bounds=None, count=1):
     params = take_apart(jnp.zeros(N), jnp.ones(N), bounds)
     center, _, fun = history.best(jnp.zeros(N))
-    return trust.propose(history, center, fun, params, count), center, fun
+    at_once = count, jnp.asarray(0, jnp.int32)
+    return trust.propose(history, center, fun, params, at_once), center, fun
 
 
 def proposal_of(history, radius=10.0, bounds=None, count=1):
@@ -61,7 +62,7 @@ def test_ten_points_determine_a_quadratic_in_three_dimensions(x64, width):
     history = known(around(10, width), lambda x: bowl(x / width))
     _, proposal, center, fun = proposal_of(history, 10 * width)
     np.testing.assert_allclose(proposal.hessian * width**2, HESSIAN, rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(center + proposal.steps[0], BEST * width, rtol=1e-3)
+    np.testing.assert_allclose(center + proposal.points[0], BEST * width, rtol=1e-3)
     assert proposal.reduction[0] == pytest.approx(fun - 2, rel=1e-3)
 
 
@@ -76,21 +77,30 @@ def test_one_value_that_is_huge_does_not_spoil_the_model(x64):
     points = np.concatenate([around(15), np.full((1, N), 2.0)])
     fun = lambda x: 1e30 if np.all(x == 2) else bowl(x)
     _, proposal, center, _ = proposal_of(known(points, fun))
-    np.testing.assert_allclose(center + proposal.steps[0], BEST, atol=1e-2)
+    np.testing.assert_allclose(center + proposal.points[0], BEST, atol=1e-2)
 
 
 def test_bounds_hold_and_the_rest_is_minimised(x64):
     high = jnp.array([0.1, 9.0, 9.0])
     _, proposal, center, _ = proposal_of(known(around(10)), bounds=(-9 * jnp.ones(N), high))
-    found = center + proposal.steps[0]
+    found = center + proposal.points[0]
     rest = np.linalg.solve(HESSIAN[1:, 1:], -HESSIAN[1:, 0] * (0.1 - BEST[0])) + BEST[1:]
     np.testing.assert_allclose(found, [0.1, *rest], atol=1e-4)
 
 
 def test_several_steps_at_once_have_several_radii(x64):
-    _, proposal, *_ = proposal_of(known(around(10)), radius=0.01, count=3)
-    lengths = np.linalg.norm(proposal.steps, axis=1)
+    _, proposal, *_ = proposal_of(known(around(10)), radius=0.01, count=6)
+    assert proposal.others.tolist() == 3 * [False] + 3 * [True]
+    lengths = np.linalg.norm(proposal.points[:3], axis=1)
     np.testing.assert_allclose(lengths, [0.01, 0.02, 0.005], rtol=1e-6)
+
+
+def test_a_point_beside_a_step_says_nothing_of_the_step(x64):
+    trust, proposal, _, fun = proposal_of(known(around(10)), radius=0.01, count=2)
+    good = jnp.ones(2, bool)
+    values = jnp.asarray([fun, fun - 1])  # the step failed, the point beside it is lower
+    after = REVISE(trust, proposal, jnp.asarray(fun), values, good)
+    assert after.fails == 1
 
 
 def test_the_radius_follows_the_ratio_and_the_metric_the_hessian(x64):
@@ -126,7 +136,7 @@ def test_it_is_stuck_after_five_failures_in_a_row_and_failed_without_a_radius(x6
 def test_where_the_model_is_flat_the_step_is_for_the_geometry(x64):
     _, proposal, *_ = proposal_of(known(around(7), lambda x: 1.0), radius=0.5)
     assert proposal.reduction[0] == 0
-    assert np.linalg.norm(proposal.steps[0]) == pytest.approx(0.5, rel=1e-3)
+    assert np.linalg.norm(proposal.points[0]) == pytest.approx(0.5, rel=1e-3)
 
 
 def of_check(trust, proposal, fun, rise):
@@ -142,7 +152,7 @@ def test_a_check_is_where_the_model_knows_least(x64):
         trust = QuadraticTrust.start(jnp.ones(N), jnp.asarray(0.3))
         trust = dataclasses.replace(trust, check=jnp.asarray(True))
         proposal, center, fun = propose(trust, history, bounds)
-        step = np.asarray(proposal.steps[0])
+        step = np.asarray(proposal.points[0])
         assert proposal.reduction[0] == 0
         if bounds is None:
             assert abs(step @ normal) == pytest.approx(0.3, rel=1e-6)
@@ -197,7 +207,7 @@ def test_it_works_in_float32_and_under_vmap():
 
     def step(radius):
         trust = QuadraticTrust.start(params.sigma, radius)
-        return trust.propose(history, center, fun, params, 1).steps[0]
+        return trust.propose(history, center, fun, params, (1, jnp.asarray(0, jnp.int32))).points[0]
 
     steps = jax.jit(jax.vmap(step))(jnp.array([0.1, 10.0]))
     assert steps.dtype == jnp.float32

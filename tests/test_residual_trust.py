@@ -92,7 +92,9 @@ def known(points):
 
 def propose(trust, history):
     center, row, _ = history.best(jnp.zeros(3))
-    proposal = PROPOSE(trust, history, center, row, jnp.ones(3), NONE, 1)
+    proposal = PROPOSE(
+        trust, history, center, row, jnp.ones(3), NONE, (1, jnp.asarray(0, jnp.int32))
+    )
     return proposal, center, row
 
 
@@ -118,7 +120,8 @@ def outcome(fun, trust=None, predicted=0.5, ahead=0.0):
     """The region after a step of length one from 1, where half of that was predicted."""
     one = jnp.ones((1, 1))
     proposal = Proposal(
-        steps=one,
+        points=one,
+        others=jnp.zeros(1, bool),
         predicted=predicted * one,
         reduction=(1 - predicted**2) / 2 * jnp.ones(1),
         slope=jnp.ones(1),

@@ -221,6 +221,24 @@ def test_a_bowl_ends_soon_where_rounding_is_all_that_is_left(n):
     assert result.evaluations < 25
 
 
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    ("n", "seed"), [(1, 0), (1, 2), (2, 3), *(pytest.param(5, k, marks=SLOW) for k in range(3))]
+)
+def test_a_quadratic_ends_soon_after_its_minimum(x64, n, seed):
+    """Points of a check lie so near that others seem to be outliers."""
+    numbers = np.random.default_rng(seed)
+    bend = jnp.asarray(numbers.standard_normal((n, n)) + 2 * np.eye(n))
+    best, lowest = jnp.asarray(numbers.standard_normal(n)), [0, 1, -300][seed % 3]
+    fun = lambda y, args: jnp.sum((bend @ (y - best)) ** 2) + lowest
+    result = sd.minimise(fun, jnp.ones(n), key=jax.random.key(seed))
+    found = next(r.evaluations for r in result.history if r.fun < lowest + 1e-9)
+    assert result.reason == "converged"
+    assert result.evaluations < found + 20
+
+
 @calls
 def test_a_parameter_that_came_nearer_as_it_failed_goes_no_farther(call):
     """It changes nothing within 0.05, and fails beyond: one step of the other finds the answer."""

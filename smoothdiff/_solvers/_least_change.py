@@ -102,15 +102,18 @@ def least_change(
     width = jnp.minimum(reach, jnp.max(jnp.where(used, distance, 0))) + tiny
     a = jnp.where(used[:, None], away[near], 0) / width
     rise = jnp.where(used, history.funs[near] - fun, 0)
+    squares = jnp.sum(a * a, axis=1)
     typical = jnp.nanmedian(jnp.where(used, jnp.abs(rise), jnp.nan))
     high, highest = _HIGH * typical + tiny, jnp.max(rise)
     above = jnp.clip(rise / high, 1, _HIGHEST)
-    rise = jnp.minimum(rise, _HIGHEST * high)
+    # what is far beside most of them may be as high as a parabola through them
+    bend = jnp.nanmedian(jnp.where(squares > 0, jnp.abs(rise) / (squares + tiny), jnp.nan))
+    rise = jnp.minimum(rise, jnp.fmax(_HIGHEST * high, _HIGH * bend * squares))
 
     old = before * width**2
     borders = jnp.concatenate([used[:, None].astype(dtype), a], axis=1)
     corner = -jnp.finfo(dtype).eps * jnp.eye(n + 1, dtype=dtype)
-    bends, sixth = dot(a, a.T) ** 2 / 2, jnp.sum(a * a, axis=1) ** 3
+    bends, sixth = dot(a, a.T) ** 2 / 2, squares**3
     farthest = jnp.argmax(jnp.where(used, distance, -1))
     left = rise - jnp.sum(dot(a, old) * a, axis=1) / 2
     sides = jnp.stack([jnp.where(used, left, 0), jnp.eye(len(a), dtype=dtype)[farthest]])

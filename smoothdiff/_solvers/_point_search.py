@@ -306,11 +306,6 @@ class AbstractPointSearch(eqx.Module):
         return best if self.average is None else self.average.over(best)
 
 
-def powers_of_two(count: int, dtype: Any) -> Float[Array, " count"]:
-    """1, 2, 1/2, 4, 1/4 ...: the radii of steps that are tried at once."""
-    return jnp.asarray([2.0 ** -((k + 1) // 2 * (-1) ** k) for k in range(count)], dtype)
-
-
 def nothing(width: Float[Array, ""]) -> Bool[Array, ""]:
     """Whether a width, relative to sigma, is so small that the function cannot be told apart."""
     return width <= _NOTHING * jnp.finfo(width.dtype).eps

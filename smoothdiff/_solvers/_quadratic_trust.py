@@ -19,13 +19,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
 from smoothdiff._products import dot
+from smoothdiff._solvers._at_once import beside, radii
 from smoothdiff._solvers._base import all_finite
 from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._least_change import least_change
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._model_check import check_step, is_right
-from smoothdiff._solvers._point_search import nothing, powers_of_two
+from smoothdiff._solvers._point_search import nothing
 from smoothdiff._solvers._ratio_test import asks_nothing, lost_in_rounding, ratio_test, settled
 
 # an evaluation so many radii away should make way for a nearer one
@@ -40,15 +41,17 @@ _PATIENCE, _NEAR = 2, 0.5
 
 
 class Proposal(NamedTuple):
-    """Steps to evaluate, in units of the metric, and what the model says of them.
+    """Points to evaluate, in units of the metric, and what the model says of them.
 
-    The first may be a `check` that the function rises there as predicted. The radius is `tight`
-    where the model promises no more within it than rounding may take, but may beyond. The Hessian
-    is `determined` by as many points as it takes. A step may be `lost` in the parameters' rounding.
+    The `others` are no steps, see `beside`. The first may be a `check` that the function rises
+    there as predicted. The radius is `tight` where the model promises no more within it than
+    rounding may take, but may beyond. The Hessian is `determined` by as many points as it takes. A
+    step may be `lost` in the parameters' rounding.
     """
 
-    steps: Float[Array, "K n"]
-    reduction: Float[Array, " K"]
+    points: Float[Array, "K n"]
+    others: Bool[Array, " K"]
+    reduction: Float[Array, " M"]
     hessian: Float[Array, "n n"]
     poor: Bool[Array, ""]
     check: Bool[Array, ""]
@@ -89,8 +92,9 @@ class QuadraticTrust(eqx.Module):
         """No steps, where so many other points are evaluated."""
         zeros, no = lambda *shape: jnp.zeros(shape, self.radius.dtype), jnp.asarray(False)
         return Proposal(
-            steps=zeros(count, len(self.hessian)),
-            reduction=zeros(count),
+            points=zeros(count, len(self.hessian)),
+            others=jnp.zeros(count, bool),
+            reduction=jnp.zeros_like(radii(self.radius, count)),
             hessian=self.hessian,
             poor=no,
             check=no,
@@ -129,17 +133,20 @@ class QuadraticTrust(eqx.Module):
         center: Float[Array, " n"],
         fun: Float[Array, ""],
         params: Params,
-        count: int,
+        at_once: tuple[int, Int[Array, ""]],
     ) -> Proposal:
-        """Minimisers of the model within this radius and others, or a point that teaches it."""
+        """Minimisers of the model within this radius and others, and points that teach it.
+
+        So many `at_once`, after so many others.
+        """
         model = least_change(history, center, fun, self.metric, self.radius, self.hessian)
         grad, hessian, (constant, slope, bend) = model.grad, model.hessian, model.polynomial
 
         def minimiser(hessian: Array, grad: Array, radius: Array) -> Array:
             return self._within_bounds(hessian, grad, radius, center, params)
 
-        radii = self.radius * powers_of_two(count, fun.dtype)
-        steps = jax.vmap(lambda radius: minimiser(hessian, grad, radius))(radii)
+        tried = radii(self.radius, at_once[0])
+        steps = jax.vmap(lambda radius: minimiser(hessian, grad, radius))(tried)
         change = lambda steps, slope, bend: (
             dot(steps, slope) + jnp.sum(dot(steps, bend) * steps, axis=1) / 2
         )
@@ -166,12 +173,12 @@ class QuadraticTrust(eqx.Module):
         which = jnp.where(check, 2, self.improve.astype(jnp.int32))
         first = jax.lax.switch(which, [lambda: steps[0], other, checked])
         rise = change(first[None], grad, hessian)[0]
-        steps = steps.at[0].set(first)
+        points, others = beside(steps.at[0].set(first), steps[0], self.radius, *at_once)
         reduction = reduction.at[0].set(jnp.where(which > 0, 0, reduction[0]))
         poor = (model.farthest > _FAR * self.radius) & (model.used > len(center) + 1)
-        lost = lost_in_rounding(self.metric.out(steps[0]), center)
+        lost = lost_in_rounding(self.metric.out(first), center)
         said = asked.tight, model.determined, lost
-        return Proposal(steps, reduction, hessian, poor, check, rise, *said)
+        return Proposal(points, others, reduction, hessian, poor, check, rise, *said)
 
     def _within_bounds(
         self, hessian: Array, grad: Array, radius: Array, center: Array, params: Params
@@ -195,7 +202,7 @@ class QuadraticTrust(eqx.Module):
         good: Bool[Array, " K"],
     ) -> "QuadraticTrust":
         """The region after these values came; its metric follows a Hessian that can be trusted."""
-        funs = jnp.where(good, funs, jnp.inf)
+        funs = jnp.where(good & ~proposal.others, funs, jnp.inf)
         best = jnp.argmin(funs)
         # what rounding may do says nothing against the model
         fun, reduction = funs[best], jnp.where(proposal.lost, 0, proposal.reduction[best])
@@ -208,14 +215,14 @@ class QuadraticTrust(eqx.Module):
         # a check is no step, but a model that is right about it may have converged
         right = proposal.check & is_right(before, funs[0], proposal.rise)
         usable = all_finite((metric, turn)) & (right | proposal.tight | proposal.determined)
-        still = Metric.of(jnp.ones_like(proposal.steps[0]), True)
+        still = Metric.of(jnp.ones_like(proposal.points[0]), True)
         metric, turn = jax.tree.map(
             lambda a, b: jnp.where(usable, a, b), (metric, turn), (self.metric, still)
         )
-        length = jnp.linalg.norm(turn.into(proposal.steps[best]))
-        radii = self.radius * powers_of_two(len(funs), length.dtype)
+        length = jnp.linalg.norm(turn.into(proposal.points[best]))
+        tried = radii(self.radius, len(funs))
         # in the units that the step was made in
-        moved = jnp.linalg.norm(proposal.steps[best])
+        moved = jnp.linalg.norm(proposal.points[best])
         # a model of far points is made better before it is trusted less
         patient = (fails < _PATIENCE) | ((self.radius <= _NEAR) & (fun != before))
         wait = proposal.poor & patient & ~long
@@ -224,7 +231,7 @@ class QuadraticTrust(eqx.Module):
         radius = jnp.where(failed & ~wait, lower, self.radius)
         radius = jnp.where(held, jnp.maximum(radius, 2 * length), radius)
         radius = jnp.where(proposal.tight & ~self.teaches(), 2 * self.radius, radius)
-        ends = settled(self.settled | proposal.lost, outcome, moved, radii[best])
+        ends = settled(self.settled | proposal.lost, outcome, moved, tried[best])
         return QuadraticTrust(
             metric=metric,
             radius=radius,

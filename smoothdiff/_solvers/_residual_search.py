@@ -161,8 +161,10 @@ class ResidualSearch(AbstractPointSearch):
         def local() -> tuple[Array, Proposal]:
             center, row, _ = self.history.best(self.start)
             sides = sides_of(params, center)
-            proposal = self.trust.propose(self.history, center, row, sigma, sides, count)
-            return center[None] + sigma[None] * proposal.steps, proposal
+            proposal = self.trust.propose(
+                self.history, center, row, sigma, sides, (count, self.evaluated)
+            )
+            return center[None] + sigma[None] * proposal.points, proposal
 
         def wide() -> tuple[Array, Proposal]:
             wide, samples = self.wide, draw(max(sizes.first - 1, 1))

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._products import dot
+from smoothdiff._solvers._at_once import beside, radii
 from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._history import History
-from smoothdiff._solvers._point_search import powers_of_two
 from smoothdiff._solvers._ratio_test import ratio_test, settled, taken_by_rounding
 
 # evaluations that a fit may use for each parameter, and how far they count, in radii
@@ -48,16 +48,17 @@ _SHORTER, _SMOOTH = 0.6, 0.8
 
 
 class Proposal(NamedTuple):
-    """Steps to evaluate, in units of sigma, and what the model says of them.
+    """Points to evaluate, in units of sigma, and what the model says of them.
 
-    A step of one sigma, or as long as the radius if that is more, would reduce the loss by what is
-    `ahead`.
+    The `others` are no steps, see `beside`. A step of one sigma, or as long as the radius if that
+    is more, would reduce the loss by what is `ahead`.
     """
 
-    steps: Float[Array, "K n"]
-    predicted: Float[Array, "K P"]
-    reduction: Float[Array, " K"]
-    slope: Float[Array, " K"]
+    points: Float[Array, "K n"]
+    others: Bool[Array, " K"]
+    predicted: Float[Array, "M P"]
+    reduction: Float[Array, " M"]
+    slope: Float[Array, " M"]
     ahead: Float[Array, ""]
     jacobian: Float[Array, "n P"]
     poor: Bool[Array, ""]
@@ -98,12 +99,14 @@ class TrustRegion(eqx.Module):
     def nothing(self, count: int) -> Proposal:
         """No steps, where so many other points are evaluated."""
         n, size = self.jacobian.shape
+        tried = len(radii(self.radius, count))
         zeros = lambda *shape: jnp.zeros(shape, self.radius.dtype)
         return Proposal(
-            steps=zeros(count, n),
-            predicted=zeros(count, size),
-            reduction=zeros(count),
-            slope=zeros(count),
+            points=zeros(count, n),
+            others=jnp.zeros(count, bool),
+            predicted=zeros(tried, size),
+            reduction=zeros(tried),
+            slope=zeros(tried),
             ahead=zeros(),
             jacobian=self.jacobian,
             poor=jnp.asarray(False),
@@ -138,14 +141,16 @@ class TrustRegion(eqx.Module):
         row: Float[Array, " P"],
         sigma: Float[Array, " n"],
         sides: tuple[Array | None, Array | None],
-        count: int,
+        at_once: tuple[int, Int[Array, ""]],
     ) -> Proposal:
-        """Minimisers of the model within this radius and others, or a point for the geometry."""
+        """Minimisers of the model within this radius and others, and points for the geometry.
+
+        So many `at_once`, after so many others.
+        """
         jacobian, lacking, poor = self._fit(history, center, row, sigma)
         hessian, grad = dot(jacobian, jacobian.T), dot(jacobian, row)
-        radii = self.radius * powers_of_two(count, row.dtype)
-        radii = jnp.append(radii, jnp.maximum(self.radius, 1))
-        steps = jax.vmap(lambda radius: bounded_step(hessian, grad, radius, *sides))(radii)
+        tried = jnp.append(radii(self.radius, at_once[0]), jnp.maximum(self.radius, 1))
+        steps = jax.vmap(lambda radius: bounded_step(hessian, grad, radius, *sides))(tried)
         change, slope = dot(steps, jacobian), -dot(steps, grad)
         reduction = slope - jnp.sum(change**2, axis=1) / 2
         # squares of residuals that were once larger are not known any better than that
@@ -156,9 +161,10 @@ class TrustRegion(eqx.Module):
         eps = jnp.finfo(row.dtype).eps
         improve = self.improve | ~(reduction[0] > eps * jnp.sum(row**2))
         other = _roomy(self.radius * lacking, *sides)
-        steps = steps.at[0].set(jnp.where(improve, other, steps[0]))
+        first = steps.at[0].set(jnp.where(improve, other, steps[0]))
+        points, others = beside(first, steps[0], self.radius, *at_once)
         reduction = reduction.at[0].set(jnp.where(improve, 0, reduction[0]))
-        return Proposal(steps, row[None] + change, reduction, slope, ahead, jacobian, poor)
+        return Proposal(points, others, row[None] + change, reduction, slope, ahead, jacobian, poor)
 
     def _fit(
         self, history: History, center: Array, row: Array, sigma: Array
@@ -199,10 +205,10 @@ class TrustRegion(eqx.Module):
     ) -> "TrustRegion":
         """The region after the residuals `rows` came."""
         before = jnp.sum(row**2) / 2
-        funs = jnp.where(good, jnp.sum(rows**2, axis=1) / 2, jnp.inf)
+        funs = jnp.where(good & ~proposal.others, jnp.sum(rows**2, axis=1) / 2, jnp.inf)
         best = jnp.argmin(funs)
         fun, reduction = funs[best], proposal.reduction[best]
-        length: Array = jnp.linalg.norm(proposal.steps[best])
+        length: Array = jnp.linalg.norm(proposal.points[best])
         tiny = jnp.finfo(row.dtype).tiny
         off = jnp.linalg.norm(rows[best] - proposal.predicted[best])
         expected = jnp.linalg.norm(proposal.predicted[best] - row)
@@ -214,7 +220,7 @@ class TrustRegion(eqx.Module):
         promised = outcome.more | (proposal.ahead > taken_by_rounding(before))
         outcome = outcome._replace(more=promised)
         tried, failed, held, long, fails, _ = outcome
-        radii = self.radius * powers_of_two(len(funs), length.dtype)
+        tested = radii(self.radius, len(funs))
         shorter = (self.fails > 0) & (length < _SHORTER * self.length)
         more = same | (shorter & (error >= _SMOOTH * self.error))
         rough = jnp.where(more, self.rough + 1, self.rough)
@@ -240,7 +246,7 @@ class TrustRegion(eqx.Module):
             length=jnp.where(failed, length, self.length),
             slow=jnp.where((fun < (1 - _LITTLE) * before) | grow, 0, self.slow + len(rows)),
             worked=self.worked | (tried & ~failed),
-            settled=settled(self.settled, outcome, length, radii[best]),
+            settled=settled(self.settled, outcome, length, tested[best]),
             foreseen=jnp.where(grow, jnp.maximum(self.foreseen, length), self.foreseen),
         )
         return revised

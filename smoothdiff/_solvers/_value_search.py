@@ -56,8 +56,10 @@ class ValueSearch(ValueState):
 
         def local() -> tuple[Array, Proposal]:
             center, _, fun = self.history.best(self.start)
-            proposal = self.trust.propose(self.history, center, fun, params, count)
-            return center[None] + self.trust.metric.out(proposal.steps), proposal
+            proposal = self.trust.propose(
+                self.history, center, fun, params, (count, self.evaluated)
+            )
+            return center[None] + self.trust.metric.out(proposal.points), proposal
 
         def wide() -> tuple[Array, Proposal]:
             z = draw(sizes.first)[jnp.minimum(self.taken + slot, sizes.first - 1)]

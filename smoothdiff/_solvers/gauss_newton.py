@@ -86,8 +86,9 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             far the first points are from the start. A number or a pytree like the parameters
             adapts. An optax schedule, a function from the number of the step to a number, is
             followed as it is.
-        num_samples: evaluations a step, which can run at once: ends of steps at several radii. By
-            default one; for 100 parameters and more n / 2, at most 96.
+        num_samples: evaluations a step, which can run at once: ends of steps at several radii, and
+            points beside them, from which the model learns. By default one; for 100
+            parameters and more n / 2, at most 96.
         history: how many evaluations to keep in memory, with their residuals. By default 12 n,
             between 32 and 256, and at least three rounds; with 100 parameters and more, four
             batches.

@@ -82,8 +82,9 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         sigma: the smoothing width in the units of the parameters: a number or a pytree like the
             parameters to begin with; or an optax schedule, a function from the number of the step
             to a number, that is followed.
-        num_samples: evaluations a step, which can run at once: ends of steps at several radii. By
-            default one; with batches 4 + 3 log n for n parameters.
+        num_samples: evaluations a step, which can run at once: ends of steps at several radii, and
+            points beside them, from which the model learns. By default one; with batches 4 + 3 log
+            n for n parameters.
         history: how many evaluations are kept, by default (n + 1)(n + 2), but from 40 to 512, and
             less where they would take more than 128 MB.
         sampler: where to sample, one whose points are normal; by default `Sobol`.

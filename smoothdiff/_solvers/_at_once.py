@@ -1,0 +1,56 @@
+"""Evaluations that run at once: steps at several radii, and points beside the model's step."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+# at most so many radii; more tell less than points beside the step
+_RADII = 3
+# a step that differs from another by less than this share of its length is the same
+_SAME = 1e-3
+
+
+def radii(radius: Float[Array, ""], count: int) -> Float[Array, " M"]:
+    """The radii of steps where so many evaluations run at once: the radius, twice, half of it.
+
+    For every second evaluation one.
+    """
+    factors = [2.0 ** -((k + 1) // 2 * (-1) ** k) for k in range(min((count + 1) // 2, _RADII))]
+    return radius * jnp.asarray(factors, radius.dtype)
+
+
+def beside(
+    steps: Float[Array, "M n"],
+    step: Float[Array, " n"],
+    radius: Float[Array, ""],
+    count: int,
+    turn: Int[Array, ""],
+) -> tuple[Float[Array, "K n"], Bool[Array, " K"]]:
+    """So many points, and which of them are no steps.
+
+    Those lie beside the end of the model's step, as far from it as that is long, along one axis
+    after the other. What is another step once more makes way for them, too: where the minimiser is
+    within the region, it is that of all radii.
+
+    Args:
+        steps: steps, or a point that teaches the model in place of the first.
+        step: that of the model.
+        radius: of the region, for a step of no length.
+        count: how many are evaluated at once.
+        turn: how many were evaluated before, for the axes.
+    """
+    if count == 1:
+        return steps, jnp.zeros(1, bool)
+    n, size = len(step), jnp.linalg.norm(steps, axis=1)
+    between = jnp.linalg.norm(steps[:, None] - steps[None], axis=2)
+    again = jnp.any(jnp.tril(between <= _SAME * size[:, None], -1), axis=1)
+    more = count - len(steps)
+    others = jnp.concatenate([again, jnp.ones(more, bool)])
+    steps = jnp.concatenate([steps, jnp.zeros((more, n), steps.dtype)])
+    # one axis after the other, then back along each
+    axis = turn // count * more + jnp.cumsum(others, dtype=turn.dtype)
+    sign = jnp.where(axis // n % 2 == 0, 1, -1).astype(steps.dtype)
+    away = sign[:, None] * jax.nn.one_hot(axis % n, n, dtype=steps.dtype)
+    length = jnp.linalg.norm(step)
+    length = jnp.where(length > 0, length, radius)
+    return jnp.where(others[:, None], step[None] + length * away, steps), others

@@ -1,0 +1,80 @@
+"""Evaluations that run at once: steps at several radii, and points beside the model's step."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import smoothdiff as sd
+from smoothdiff._solvers._at_once import beside, radii
+
+ZERO = jnp.asarray(0, jnp.int32)
+
+
+def test_one_evaluation_is_the_step():
+    assert radii(jnp.asarray(0.5), 1).tolist() == [0.5]
+    points, others = beside(jnp.ones((1, 3)), jnp.ones(3), jnp.asarray(1.0), 1, ZERO)
+    assert (points.tolist(), others.tolist()) == ([3 * [1]], [False])
+
+
+@pytest.mark.parametrize(
+    ("count", "factors"), [(2, [1]), (3, [1, 2]), (4, [1, 2]), (5, [1, 2, 0.5]), (9, [1, 2, 0.5])]
+)
+def test_half_of_the_evaluations_are_steps_and_at_most_three(count, factors):
+    np.testing.assert_allclose(radii(jnp.asarray(3.0), count), 3.0 * np.array(factors))
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_points_beside_a_step_lie_on_one_axis_after_the_other(x64, dtype):
+    step = jnp.array([3.0, 4.0], dtype)
+    steps = jnp.stack([step, 2 * step, step / 2])
+    found = []
+    for turn in (0, 7):
+        points, others = beside(steps, step, jnp.asarray(1, dtype), 7, ZERO + turn)
+        assert points.dtype == dtype
+        assert others.tolist() == 3 * [False] + 4 * [True]
+        np.testing.assert_array_equal(points[:3], steps)
+        found += ((np.asarray(points[3:]) - np.asarray(step)) / 5).tolist()
+    axes = [[0, 1], [-1, 0], [0, -1], [1, 0]]
+    np.testing.assert_allclose(found[:4], axes, atol=1e-6)
+    assert len({tuple(np.round(one).tolist()) for one in found}) == 4
+
+
+def test_a_step_that_comes_twice_makes_way_for_a_point_beside_it():
+    step = jnp.array([3.0, 4.0])
+    steps = jnp.stack([step, step * (1 + 1e-5), step / 2])
+    points, others = beside(steps, step, jnp.asarray(9.0), 3, ZERO)
+    assert others.tolist() == [False, True, False]
+    assert float(jnp.linalg.norm(points[1] - step)) == pytest.approx(5)
+
+
+def test_beside_no_step_points_are_as_far_as_the_radius():
+    points, _ = beside(jnp.zeros((1, 2)), jnp.zeros(2), jnp.asarray(0.25), 2, ZERO)
+    assert jnp.linalg.norm(points[1]) == 0.25
+
+
+@pytest.mark.parametrize("count", [1, 2, 4, 8])
+@pytest.mark.parametrize("residuals", [False, True])
+def test_so_many_at_once_solve_a_quadratic_in_fewer_steps(x64, count, residuals):
+    bend = jnp.array([[1.0, 0.3, 0.0], [0.0, 2.0, 0.5], [0.0, 0.0, 0.7]])
+    rows = lambda y, args: bend @ (y - jnp.array([1.0, -0.5, 2.0]))
+    call, solver = sd.minimise, sd.NewtonCG(0.3, num_samples=count)
+    fun = lambda y, args: jnp.sum(rows(y, args) ** 2)
+    if residuals:
+        call, fun, solver = sd.least_squares, rows, sd.GaussNewton(0.3, num_samples=count)
+    result = call(fun, jnp.zeros(3), key=jax.random.key(0), solver=solver, max_steps=60)
+    solved = next(r.step for r in result.history if r.fun < 1e-12)
+    determined = 4 if residuals else 10
+    assert solved <= determined / count + 5
+    assert result.reason == "converged"
+
+
+def test_a_round_of_samples_is_no_smaller_for_few_at_once():
+    y = jnp.zeros(3)
+    for solver in (sd.NewtonCG, sd.GaussNewton):
+        usual = solver(0.1).sizes(y)
+        for count in (1, 2, 3, 16):
+            sizes = solver(0.1, num_samples=count).sizes(y)
+            assert sizes.step == count
+            assert sizes.first >= usual.first
+            assert sizes.first % count == sizes.later % count == 0
