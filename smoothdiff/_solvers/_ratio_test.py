@@ -13,8 +13,9 @@ _FAR_OFF = 10.0
 _INSIDE = 0.95
 # a reduction of so many roundings of the value is nothing, a rise of so many is one for sure
 _NOTHING, TELLING = 8, 1000
-# a step of so many roundings of the parameters may be lost in those of the function's own sums
-_LOST = 64
+# a step of so many roundings of the parameters may be lost in those of the function's own sums; in
+# float32 that would be too long a step to do without
+_LOST = {"float32": 8, "float64": 64}
 # points are near each other within so many sigmas
 _NARROW = 1e-3
 
@@ -80,7 +81,8 @@ def taken_by_rounding(fun: Float[Array, ""]) -> Float[Array, ""]:
 
 def lost_in_rounding(move: Float[Array, " n"], center: Float[Array, " n"]) -> Bool[Array, ""]:
     """Whether a step moves parameters by so few roundings that what it promises may be lost."""
-    return jnp.all(jnp.abs(move) <= _LOST * jnp.finfo(move.dtype).eps * jnp.abs(center))
+    roundings = _LOST[move.dtype.name] * jnp.finfo(move.dtype).eps
+    return jnp.all(jnp.abs(move) <= roundings * jnp.abs(center))
 
 
 def is_lower(fun: Float[Array, ""], before: Float[Array, ""]) -> Bool[Array, ""]:
