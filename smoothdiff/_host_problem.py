@@ -15,6 +15,7 @@ from smoothdiff._call_checks import check_squares
 from smoothdiff._host_function import evaluator, rows_at, traced
 from smoothdiff._host_steps import HostSteps
 from smoothdiff._known import Known
+from smoothdiff._layout import layout_of
 from smoothdiff._problem import Problem, Trial
 from smoothdiff._programs import is_short
 from smoothdiff._solvers._evaluator import Evaluator
@@ -26,7 +27,7 @@ from smoothdiff._solvers._random_numbers import in_round, takes_key
 class HostProblem(Problem):
     """A problem whose solver steps point by point."""
 
-    host: "HostSteps"
+    host: HostSteps
     known: Known | None
     quick: bool = eqx.field(static=True, default=False)
 
@@ -67,15 +68,21 @@ class HostProblem(Problem):
         if (answered := self._answered() - before) > 0:
             count = state.progress.evaluations - answered
             state = eqx.tree_at(lambda s: s.progress.evaluations, state, count)
-        return y, state, over | self._complete()
+        return y, state, over | self._exhausted()
 
     def done(self, y: PyTree, state: PointState) -> Bool[Array, ""]:
         """Whether the solver wants to stop before a step, compiled for shapes."""
-        return _done(self.host.parts(y, state)) | self._complete()
+        return _done(self.host.parts(y, state)) | self._exhausted()
 
     def reason(self, state: PointState) -> str:
         """As the solver, unless all points are known."""
-        return "converged" if self._complete() else super().reason(state)
+        return "converged" if self.known and self.known.complete else super().reason(state)
+
+    def resumed(self, state: PointState) -> None:
+        """Knows what the search has evaluated."""
+        if self.known is not None:
+            history, layout = state.search.history, layout_of(state.progress.lowest_y)
+            self.known.learn(history.points[history.valid], layout, history.rows[history.valid])
 
     def spare(self, y: PyTree, state: PointState) -> int:
         """Of the evaluations for the judgement, those that a function without noise leaves."""
@@ -89,49 +96,47 @@ class HostProblem(Problem):
         """The lowest point once more."""
         point, fun = state.progress.lowest_y, state.progress.lowest_fun
         points = jax.tree.map(lambda a: a[None], point)
-        before = self._answered()
         again = self._values(y).at(points, jnp.asarray(0, jnp.int32))
-        noisy = bool(~jnp.isfinite(fun) | differ(again[0], fun))
-        return Trial(again, noisy, 1 - (self._answered() - before))
+        return Trial(again, bool(~jnp.isfinite(fun) | differ(again[0], fun)))
 
     def judge(
         self, y: PyTree, state: PointState, trial: Trial | None = None
     ) -> tuple[PyTree, dict[str, Any]]:
         """Decided on the host, so that nothing is compiled for it."""
         values, parts = self._values(y), self.host.parts(y, state)
-        before = self._answered()
         if trial is None:
-            y, stats = parts.judge(values, _loop)
-        elif trial.noisy:
-            values = values._replace(at=partial(_known_last, values.at, trial))
-            y, stats = parts.judge(values, _loop)
-        else:
-            y, stats = parts.judge(values, _once)
-            before += trial.evaluations
-        return y, stats | {"evaluations": stats["evaluations"] - (self._answered() - before)}
+            return parts.judge(values, _loop)
+        if trial.noisy:
+            return parts.judge(values._replace(at=partial(_known_last, values.at, trial)), _loop)
+        y, stats = parts.judge(values, _once)
+        return y, stats | {"evaluations": stats["evaluations"] + 1}
 
     def _values(self, y: PyTree) -> Values:
+        """The function itself, also where it is known: that may have been luck."""
+
         def at(points: PyTree[Array], number: Array) -> Array:
             args = in_round(self.args, self.options, number)
             evaluate = _evaluator(self, args, y)
             vectors = jax.vmap(lambda y: evaluate.layout.vector(jax.tree.leaves(y)))(points)
-            rows = self._rows(evaluate, vectors, self.host.sizes.step)
-            return evaluate.funs(rows)
+            return evaluate.funs(self._rows(evaluate, vectors, self.host.sizes.step, judging=True))
 
         return Values(at, takes_key(self.options))
 
-    def _rows(self, evaluate: Evaluator, points: Array, at_once: int) -> Array:
+    def _rows(
+        self, evaluate: Evaluator, points: Array, at_once: int, judging: bool = False
+    ) -> Array:
         """What the function returns at points, so many at once, unless it is known."""
         fresh = lambda points: rows_at(evaluate, points, at_once, self.quick)
         if self.known is None:
             return fresh(points)
-        return self.known.rows(points, evaluate.layout, fresh)
+        rows = self.known.fresh if judging else self.known.rows
+        return rows(points, evaluate.layout, fresh)
 
     def _answered(self) -> int:
         return 0 if self.known is None else self.known.answered
 
-    def _complete(self) -> bool:
-        return self.known is not None and self.known.complete
+    def _exhausted(self) -> bool:
+        return self.known is not None and self.known.exhausted
 
 
 def _evaluator(problem: HostProblem, args: PyTree, y: PyTree) -> Evaluator:

@@ -13,11 +13,10 @@ from smoothdiff._solvers._evaluator import called
 
 
 class Trial(NamedTuple):
-    """The function at the lowest point once more, whether it is another value, and what it took."""
+    """The function at the lowest point once more, and whether it is another value."""
 
     fun: Float[Array, " 1"]
     noisy: bool
-    evaluations: int
 
 
 class Problem(eqx.Module):
@@ -50,6 +49,9 @@ class Problem(eqx.Module):
     def reason(self, state: Any) -> str:
         """One word for why it stops here, where `done` said so."""
         return self.solver.reason(state)
+
+    def resumed(self, state: Any) -> None:
+        """Told of the state of a run that is taken up."""
 
     def stage(self, state: Any) -> int:
         """Which of the steps comes next that are compiled each by itself."""

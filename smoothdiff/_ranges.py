@@ -132,7 +132,7 @@ class Integer(AbstractSpace):
 
     If all parameters are whole numbers, with fewer than 100 of them, `minimise` and `least_squares`
     evaluate a function without noise once at each point, and end where it is known at all. Two
-    points, evaluated twice, show that there is no noise.
+    points, and what is returned, are evaluated twice, to see that there is no noise.
 
     Args:
         low: the least number, or one for each number of the parameter.

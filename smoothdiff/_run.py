@@ -102,6 +102,7 @@ class Run:
             self.history = _unstack(saved[2])
             self.start -= self.history[-1].seconds
             self._check_function(file)
+            problem.resumed(self.state)
         self.file = file
 
     def _check_function(self, file: Checkpoint) -> None:

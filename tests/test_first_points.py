@@ -19,7 +19,7 @@ def measured(losses, count=1):
         at, taken = (np.asarray(a) for a in first.next(count))
         evaluated += at[taken].tolist()
         funs = np.asarray(losses(np.asarray(first.reach)))[at]
-        first = first.after(jnp.asarray(np.where(taken, funs, 0.0)))
+        first = first.after(jnp.asarray(np.where(taken, funs, 0.0)), jnp.zeros(3, bool))
     return np.asarray(first.reach), evaluated
 
 
@@ -49,6 +49,27 @@ def test_where_there_is_no_number_the_next_point_is_a_tenth_as_far(x64):
     np.testing.assert_allclose(reach, [1, 0.01, 1e-3])
     # each place twice, as a failure may be one by chance
     assert evaluated == [0, 1, *[2] * 5, *[3] * 8]
+
+
+def test_of_a_point_that_fails_the_other_side_comes_first(x64):
+    first, seen = FirstPoints.start(jnp.zeros(1)), []
+    for fun in [1.0, *7 * [np.inf]]:
+        seen.append(float(jnp.where(first.turned, -1, 1)[0] * first.reach[0]))
+        first = first.after(jnp.array([fun]), jnp.ones(1, bool))
+    np.testing.assert_allclose(seen, [1, 1, 1, -1, -1, 0.1, 0.1, -0.1], rtol=1e-6)
+
+
+@pytest.mark.parametrize("bounds", [None, (-2.0, 4.0)])
+def test_a_start_at_the_edge_of_where_it_fails_is_left(bounds):
+    """Half of the first points fail, however near they are."""
+
+    def rows(y, args):
+        linear = jnp.array([y[0] - 0.2, 2 * (y[1] + 0.3), y[2] * y[0] - 0.1])
+        return jnp.where(y[0] + y[1] > 2.0, jnp.nan, linear)
+
+    result = sd.least_squares(rows, jnp.ones(3), key=jax.random.key(0), bounds=bounds)
+    np.testing.assert_allclose(result.y, [0.2, -0.3, 0.5], atol=1e-3)
+    assert result.evaluations < 60
 
 
 def test_a_start_without_a_number_asks_for_nothing_nearer():

@@ -6,13 +6,17 @@ import numpy as np
 import pytest
 
 import smoothdiff as sd
+from smoothdiff._known import Known
+from smoothdiff._layout import layout_of
+from smoothdiff._unit_space import UnitSpace
 
 KEY = jax.random.key(0)
 BEST = np.array([3, 17, 9])
 GRID = sd.Integer(0, 20)
 START = {"a": 10, "b": jnp.array([10, 10])}
-# evaluated again: two to see that there is no noise, and one to see what a black box returns
-AGAIN = 3
+# evaluated again: two to see that there is no noise, one to see what a black box returns, and at
+# most so many to judge
+AGAIN = 3 + 3
 
 
 class Counted:
@@ -70,7 +74,7 @@ def test_a_function_of_jax_is_known_as_well():
     fun = lambda y, args: (y["a"] - 3) ** 2 + jnp.sum(y["b"]) - 18
     result = sd.minimise(fun, y0, key=KEY, space=space)
     assert result.fun == 0
-    assert result.evaluations <= 16 + 2
+    assert result.evaluations <= 16 + AGAIN
 
 
 @pytest.mark.slow
@@ -102,6 +106,16 @@ def test_noise_that_shows_late_is_seen():
     assert result.evaluations == len(noisy.points) < 20 * few
 
 
+def test_luck_that_is_known_is_seen_in_the_end():
+    """It is quiet where the run begins: two points have the same value again."""
+    numbers = np.random.default_rng(3)
+    noise = lambda y: abs(y - 9) / 5 + 0.3 * numbers.standard_normal()
+    fun = Counted(lambda y: 1.0 if y[0] < 6 else noise(y[0]))
+    result = sd.minimise(sd.black_box(fun), 3, key=KEY, space=sd.Integer(0, 12))
+    assert result.evaluations == len(fun.points) > 2 * fun.distinct
+    assert result.fun > -0.3
+
+
 def test_a_failed_evaluation_is_tried_again():
     fun = Counted(None)
     fun.value = lambda y: np.nan if fun.points.count((4,)) == 1 and y[0] == 4 else (y[0] - 4) ** 2
@@ -123,6 +137,41 @@ def test_a_run_goes_on_from_a_checkpoint(tmp_path):
         sd.minimise(box, START, key=KEY, space=GRID, checkpoint=path, callback=stop)
     result = sd.minimise(box, START, key=KEY, space=GRID, checkpoint=path)
     assert (int(result.y["a"]), result.y["b"].tolist()) == (3, [17, 9])
+
+
+def test_a_run_that_has_ended_takes_no_step_when_it_is_called_again(tmp_path):
+    fun = Counted(lambda y: (y[0] - 4) ** 2)
+    call = lambda: sd.minimise(
+        sd.black_box(fun), 2, key=KEY, space=sd.Integer(1, 5), checkpoint=tmp_path / "run"
+    )
+    first, count = call(), len(fun.points)
+    again = call()
+    assert (again.reason, len(again.history)) == (first.reason, len(first.history))
+    # one to see what it returns, one whether it is the same function, and the judgement
+    assert len(fun.points) <= count + 2 + 3
+
+
+@pytest.mark.parametrize("target", [None, -1.0])
+def test_what_fails_always_is_tried_twice(target):
+    fun = Counted(lambda y: np.nan if y[0] == 30 else abs(y[0] - 7))
+    box = sd.black_box(fun, on_nonfinite="nan")
+    result = sd.minimise(box, 2, key=KEY, space=sd.Integer(0, 30), target=target)
+    assert (int(result.y), result.fun) == (7, 0)
+    assert fun.points.count((30,)) <= 2
+    assert result.evaluations == len(fun.points) <= 31 + AGAIN + 4
+
+
+def test_numbers_of_different_types_have_names_of_their_own():
+    with jax.enable_x64(True):
+        y = {"a": np.uint64(1), "b": np.int64(2)}
+        units = UnitSpace.of(y, {"a": sd.Integer(0, 2**50), "b": sd.Integer(0, 9)})
+        known, layout = Known.of(units, None), layout_of(units.unit(y))
+        near = [units.unit({"a": a, "b": np.int64(2)}) for a in np.uint64([2**49, 2**49 + 4])]
+        points = jnp.stack([layout.vector(jax.tree.leaves(u)) for u in near])
+        known.learn(points, layout, jnp.array([[1.0], [2.0]]))
+        known.learn(points, layout, jnp.array([[1.0], [2.0]]))
+        unused = lambda points: pytest.fail("evaluated again")
+        np.testing.assert_array_equal(known.rows(points, layout, unused), [[1.0], [2.0]])
 
 
 @pytest.mark.parametrize("limit", [20, 25])

@@ -1,5 +1,7 @@
 """Evaluations that run at once: steps at several radii, and points beside the model's step."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -8,6 +10,8 @@ from jaxtyping import Array, Bool, Float, Int
 _RADII = 3
 # a step that differs from another by less than this share of its length is the same
 _SAME = 1e-3
+# how far points are beside a step, in lengths of it: not so far as its start or its double
+_AWAY = 0.8
 
 
 def radii(radius: Float[Array, ""], count: int) -> Float[Array, " M"]:
@@ -23,19 +27,21 @@ def beside(
     steps: Float[Array, "M n"],
     step: Float[Array, " n"],
     radius: Float[Array, ""],
+    inside: Callable[[Float[Array, "K n"]], Float[Array, "K n"]],
     count: int,
     turn: Int[Array, ""],
 ) -> tuple[Float[Array, "K n"], Bool[Array, " K"]]:
     """So many points, and which of them are no steps.
 
-    Those lie beside the end of the model's step, as far from it as that is long, along one axis
-    after the other. What is another step once more makes way for them, too: where the minimiser is
-    within the region, it is that of all radii.
+    Those lie beside the end of the model's step, almost as far as that is long, along one axis
+    after the other, to the side that the bounds leave longer. What is another step once more makes
+    way for them, too: where the minimiser is within the region, it is that of all radii.
 
     Args:
         steps: steps, or a point that teaches the model in place of the first.
         step: that of the model.
         radius: of the region, for a step of no length.
+        inside: takes points within the bounds.
         count: how many are evaluated at once.
         turn: how many were evaluated before, for the axes.
     """
@@ -53,4 +59,7 @@ def beside(
     away = sign[:, None] * jax.nn.one_hot(axis % n, n, dtype=steps.dtype)
     length = jnp.linalg.norm(step)
     length = jnp.where(length > 0, length, radius)
-    return jnp.where(others[:, None], step[None] + length * away, steps), others
+    forth, back = (inside(step[None] + s * _AWAY * length * away) for s in (1, -1))
+    moved = [jnp.linalg.norm(end - step[None], axis=1) for end in (forth, back)]
+    ends = jnp.where((2 * moved[0] < moved[1])[:, None], back, forth)
+    return jnp.where(others[:, None], ends, steps), others

@@ -16,9 +16,9 @@ from jaxtyping import Array, Bool, Float, Int
 # a loss so many times that at the start is far higher; linear residuals that are tried again at the
 # length that is worked out below give at most four times that
 _HIGH = 10.0
-# at so many distances a parameter is tried; at a value that is not finite it comes so much nearer,
-# else at most so much
-_DISTANCES, NEARER, _NEAREST = 4, 0.1, 1e-6
+# at so many places a parameter is tried; where no value is finite, here and to the other side, it
+# comes so much nearer, else at most so much
+_PLACES, NEARER, _NEAREST = 4, 0.1, 1e-6
 # where points are nothing beside others they are tried so many times farther
 FARTHER = 100.0
 # so often a point that fails is evaluated before one that is nearer: it may have failed by chance,
@@ -30,30 +30,34 @@ class FirstPoints(eqx.Module):
     """What is still to be evaluated: `left` counts the calls for the start and for each point.
 
     There are as many points for each parameter, one after the other. `reach` is the length of the
-    step along each parameter, in units of its sigma. `before` is the loss at the start, by which
-    `after` tells what is high; with `known` a point has one call.
+    step along each parameter, in units of its sigma, which may have `turned` to the other side.
+    `before` is the loss at the start, by which `after` tells what is high; with `known` a point has
+    one call.
     """
 
     reach: Float[Array, " n"]
+    turned: Bool[Array, " n"]
     left: Int[Array, " points"]
     before: Float[Array, ""]
 
     @staticmethod
     def start(theta: Float[Array, " n"], sides: int = 1) -> "FirstPoints":
         """Nothing has been evaluated; there are so many points for each parameter."""
-        left = jnp.full(sides * len(theta) + 1, _DISTANCES * _CALLS, jnp.int32).at[0].set(_CALLS)
-        return FirstPoints(jnp.ones_like(theta), left, jnp.asarray(jnp.inf, theta.dtype))
+        left = jnp.full(sides * len(theta) + 1, _PLACES * _CALLS, jnp.int32).at[0].set(_CALLS)
+        turned = jnp.zeros_like(theta, bool)
+        return FirstPoints(jnp.ones_like(theta), turned, left, jnp.asarray(jnp.inf, theta.dtype))
 
     def around(self, fun: Float[Array, ""]) -> "FirstPoints":
         """All parameters again, from a point with this loss."""
-        left = jnp.full_like(self.left, _DISTANCES * _CALLS).at[0].set(0)
-        return FirstPoints(self.reach, left, fun)
+        left = jnp.full_like(self.left, _PLACES * _CALLS).at[0].set(0)
+        return FirstPoints(self.reach, self.turned, left, fun)
 
     def again(self, which: Bool[Array, " n"], factor: float | Array) -> "FirstPoints":
         """These parameters once more, so many times as far away, all or each."""
         points = jnp.repeat(which, (len(self.left) - 1) // len(which))
         left = _CALLS * jnp.append(False, points).astype(self.left.dtype)
-        return FirstPoints(jnp.where(which, factor, 1) * self.reach, left, self.before)
+        reach = jnp.where(which, factor, 1) * self.reach
+        return FirstPoints(reach, self.turned, left, self.before)
 
     def done(self) -> Bool[Array, ""]:
         """Whether no point is left."""
@@ -88,8 +92,8 @@ class FirstPoints(eqx.Module):
         left = self.left.at[jnp.where(taken, at, len(self.left))].set(0, mode="drop")
         return dataclasses.replace(self, left=left)
 
-    def after(self, funs: Float[Array, " K"]) -> "FirstPoints":
-        r"""With these losses, infinite where there is none.
+    def after(self, funs: Float[Array, " K"], both: Bool[Array, " n"]) -> "FirstPoints":
+        r"""With these losses, infinite where there is none; the bounds leave some `both` sides.
 
         Linear residuals r + t d have their lowest loss along d within |r| / |d|, which a loss far
         above that at the start tells: t = sqrt(loss at the start / loss).
@@ -105,8 +109,12 @@ class FirstPoints(eqx.Module):
         later = jnp.where(high, (left - 1) // _CALLS * _CALLS, 0)
         tries = jnp.where(again, left - 1, later)
         nearer = jnp.sqrt(before / jnp.where(finite & high, funs, 1))
+        along = jnp.where(taken & (at > 0), at - 1, len(self.reach))
+        # of a point that fails the other side comes first
+        turns = ~finite & high & (tries > 0) & both[at - 1]
+        turned = self.turned.at[along].set(self.turned[at - 1] ^ turns, mode="drop")
         nearer = jnp.where(finite, jnp.maximum(nearer, _NEAREST), NEARER)
+        nearer = jnp.where(turns & ~self.turned[at - 1], 1, nearer)
         nearer = jnp.where(high & (tries > 0), nearer, 1)
         left = self.left.at[jnp.where(taken, at, len(self.left))].set(tries, mode="drop")
-        along = jnp.where(taken & (at > 0), at - 1, len(self.reach))
-        return FirstPoints(self.reach.at[along].multiply(nearer, mode="drop"), left, before)
+        return FirstPoints(self.reach.at[along].multiply(nearer, mode="drop"), turned, left, before)

@@ -27,7 +27,13 @@ from smoothdiff._solvers._least_change import least_change
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._model_check import check_step, is_right
 from smoothdiff._solvers._point_search import nothing
-from smoothdiff._solvers._ratio_test import asks_nothing, lost_in_rounding, ratio_test, settled
+from smoothdiff._solvers._ratio_test import (
+    INSIDE,
+    asks_nothing,
+    lost_in_rounding,
+    ratio_test,
+    settled,
+)
 
 # an evaluation so many radii away should make way for a nearer one
 _FAR = 2.0
@@ -155,6 +161,10 @@ class QuadraticTrust(eqx.Module):
         # where the model asks for nothing, a point that teaches it something
         check = self.check | (asked.nothing & ~self.improve)
 
+        inside = lambda ends: self.metric.into(
+            jax.vmap(params.clip)(center[None] + self.metric.out(ends)) - center[None]
+        )
+
         def other() -> Array:
             """One of the two ends of what the farthest evaluation determines alone."""
             ends = jnp.stack([minimiser(s * bend, s * slope, self.radius) for s in (1, -1)])
@@ -164,8 +174,7 @@ class QuadraticTrust(eqx.Module):
             """One of the two ends of a check, within the bounds: the lower one."""
             check = check_step(model, self.metric, center, fun, steps[0], self.radius)
             ends = jnp.stack([check, -check])
-            inside = jax.vmap(params.clip)(center[None] + self.metric.out(ends))
-            ends = self.metric.into(inside - center[None])
+            ends = inside(ends)
             length = jnp.linalg.norm(ends, axis=1)
             short = length < jnp.max(length) / 2
             return ends[jnp.argmin(jnp.where(short, jnp.inf, change(ends, grad, hessian)))]
@@ -173,10 +182,12 @@ class QuadraticTrust(eqx.Module):
         which = jnp.where(check, 2, self.improve.astype(jnp.int32))
         first = jax.lax.switch(which, [lambda: steps[0], other, checked])
         rise = change(first[None], grad, hessian)[0]
-        points, others = beside(steps.at[0].set(first), steps[0], self.radius, *at_once)
+        points, others = beside(steps.at[0].set(first), steps[0], self.radius, inside, *at_once)
         reduction = reduction.at[0].set(jnp.where(which > 0, 0, reduction[0]))
         poor = (model.farthest > _FAR * self.radius) & (model.used > len(center) + 1)
+        # a step that the radius made short may be a first one
         lost = lost_in_rounding(self.metric.out(first), center)
+        lost &= jnp.linalg.norm(first) < INSIDE * self.radius
         said = asked.tight, model.determined, lost
         return Proposal(points, others, reduction, hessian, poor, check, rise, *said)
 
@@ -202,6 +213,7 @@ class QuadraticTrust(eqx.Module):
         good: Bool[Array, " K"],
     ) -> "QuadraticTrust":
         """The region after these values came; its metric follows a Hessian that can be trusted."""
+        lowest = jnp.min(jnp.where(good, funs, jnp.inf))
         funs = jnp.where(good & ~proposal.others, funs, jnp.inf)
         best = jnp.argmin(funs)
         # what rounding may do says nothing against the model
@@ -239,7 +251,7 @@ class QuadraticTrust(eqx.Module):
             improve=failed & proposal.poor,
             check=jnp.zeros_like(self.check),
             fails=fails,
-            slow=jnp.where(fun < before, 0, self.slow + len(funs)).astype(fails.dtype),
+            slow=jnp.where(lowest < before, 0, self.slow + len(funs)).astype(fails.dtype),
             settled=jnp.where(proposal.check, right, ends),
             right=right,
         )

@@ -10,7 +10,7 @@ _FAILED, _HELD = 0.1, 0.7
 # a step that raises the function by so many times the predicted reduction was far too long
 _FAR_OFF = 10.0
 # a step of this share of the radius would have been longer without it
-_INSIDE = 0.95
+INSIDE = 0.95
 # a reduction of so many roundings of the value is nothing, a rise of so many is one for sure
 _NOTHING, TELLING = 8, 1000
 # a step of so many roundings of the parameters may be lost in those of the function's own sums; in
@@ -137,7 +137,7 @@ def settled(
     promised more than rounding may take, as where a function jumps.
     """
     worked = outcome.tried & ~outcome.failed
-    inside = (length < _INSIDE * radius) | ~(outcome.more | worked)
+    inside = (length < INSIDE * radius) | ~(outcome.more | worked)
     return inside & (before | worked) & ~(outcome.failed & outcome.more)
 
 
@@ -162,6 +162,6 @@ def asks_nothing(
     """
     unit = jnp.finfo(fun.dtype).eps * jnp.abs(fun)
     little = ~(reduction > _NOTHING * unit)
-    inside = jnp.linalg.norm(step) < _INSIDE * radius
+    inside = jnp.linalg.norm(step) < INSIDE * radius
     done = little & (rise > TELLING * unit) & inside
     return Asked(little & ~done, done | ~(reduction > unit))

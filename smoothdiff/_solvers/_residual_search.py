@@ -155,6 +155,7 @@ class ResidualSearch(AbstractPointSearch):
             units = jnp.eye(n, dtype=sigma.dtype)
             if low is not None and high is not None:
                 units = jnp.where(((high >= 1) | (high >= -low))[:, None], units, -units)
+            units = jnp.where(self.first.turned[:, None], -units, units)
             others = lambda: draw(max(sizes.first - 1, 1))
             return self.start[None] + sigma[None] * self.first.points(units, others, count), nothing
 
@@ -222,7 +223,9 @@ class ResidualSearch(AbstractPointSearch):
         return eqx.tree_at(lambda s: (s.stage, s.wide), self, (stage, wide))
 
     def _after_first(self, params: Params, funs: Float[Array, " K"]) -> "ResidualSearch":
-        first = self.first.after(funs)
+        sides = [jnp.abs(s) for s in sides_of(params, self.start) if s is not None]
+        both = jnp.all(jnp.stack([jnp.full_like(self.start, jnp.inf), *sides]) >= 1, axis=0)
+        first = self.first.after(funs, both)
         too_near = self.too_near(params.sigma)
         first = where(first.done() & jnp.any(too_near), first.again(too_near, FARTHER), first)
         stage = jnp.where(first.done(), TRUST, FIRST).astype(self.stage.dtype)

@@ -162,7 +162,9 @@ class TrustRegion(eqx.Module):
         improve = self.improve | ~(reduction[0] > eps * jnp.sum(row**2))
         other = _roomy(self.radius * lacking, *sides)
         first = steps.at[0].set(jnp.where(improve, other, steps[0]))
-        points, others = beside(first, steps[0], self.radius, *at_once)
+        low, high = (None if side is None else side[None] for side in sides)
+        inside = lambda ends: jnp.clip(ends, low, high)
+        points, others = beside(first, steps[0], self.radius, inside, *at_once)
         reduction = reduction.at[0].set(jnp.where(improve, 0, reduction[0]))
         return Proposal(points, others, row[None] + change, reduction, slope, ahead, jacobian, poor)
 
@@ -205,7 +207,8 @@ class TrustRegion(eqx.Module):
     ) -> "TrustRegion":
         """The region after the residuals `rows` came."""
         before = jnp.sum(row**2) / 2
-        funs = jnp.where(good & ~proposal.others, jnp.sum(rows**2, axis=1) / 2, jnp.inf)
+        funs = jnp.where(good, jnp.sum(rows**2, axis=1) / 2, jnp.inf)
+        lowest, funs = jnp.min(funs), jnp.where(proposal.others, jnp.inf, funs)
         best = jnp.argmin(funs)
         fun, reduction = funs[best], proposal.reduction[best]
         length: Array = jnp.linalg.norm(proposal.points[best])
@@ -244,7 +247,7 @@ class TrustRegion(eqx.Module):
             rough=rough.astype(fails.dtype),
             error=jnp.where(failed, error, self.error),
             length=jnp.where(failed, length, self.length),
-            slow=jnp.where((fun < (1 - _LITTLE) * before) | grow, 0, self.slow + len(rows)),
+            slow=jnp.where((lowest < (1 - _LITTLE) * before) | grow, 0, self.slow + len(rows)),
             worked=self.worked | (tried & ~failed),
             settled=settled(self.settled, outcome, length, tested[best]),
             foreseen=jnp.where(grow, jnp.maximum(self.foreseen, length), self.foreseen),
