@@ -227,6 +227,7 @@ def test_an_offset_costs_what_its_rounding_costs(sampler, baselines, x64):
 # derivatives in other arguments
 
 
+@pytest.mark.slow
 def test_mixed_derivatives_with_another_argument():
     """d^2 / d theta d a of a^2 boxes(x) + x^3 sin(a): unbiased, and with the variance reduced."""
     fun = lambda x, a: a**2 * boxes(x) + x[0] ** 3 * jnp.sin(a) + 5 * jnp.exp(a)

@@ -133,6 +133,7 @@ def test_a_target_a_callback_and_a_time_end_it():
     assert run(max_seconds=0.0).reason == "max_seconds"
 
 
+@pytest.mark.slow
 def test_functions_that_take_a_key_have_fresh_noise_at_all_levels():
     """The minimum of one key alone is 0.15 away: each number is a mean of sixteen draws."""
     keys = []

@@ -73,6 +73,7 @@ def test_of_linear_residuals_it_is_the_closed_form(dtype):
     np.testing.assert_allclose(ravel_pytree(errors)[0], flat, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_of_curved_residuals_it_is_that_of_the_jacobian(x64):
     result = fitted(decay, noisy(decay, TRUTH, 0.1))
     np.testing.assert_allclose(result.covariance, expected(decay, result), rtol=0.01)

@@ -248,7 +248,7 @@ COVERAGE = {
 }
 
 
-@pytest.mark.parametrize("name", quick_of(COVERAGE, ["replicates", "one set"]))
+@pytest.mark.parametrize("name", quick_of(COVERAGE, ["one set"]))
 def test_standard_errors_cover(name):
     """Nominal 95 % t-intervals of value, gradient and a Hessian-vector product over 1,000 keys.
 

@@ -163,6 +163,7 @@ def test_noise_is_averaged_by_the_population():
     assert np.sqrt(np.mean((np.asarray(result.y) - HIDDEN) ** 2)) < 0.1
 
 
+@pytest.mark.slow
 def test_trees_spaces_and_channels_that_share_a_cell():
     target = {"a": jax.random.uniform(jax.random.key(5), (4, 4, 3)), "b": jnp.full((4, 4), 7.0)}
 

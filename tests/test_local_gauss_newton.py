@@ -182,11 +182,13 @@ def test_it_says_when_it_has_converged(x64):
     assert result.history[-1].sigma < 0.01
 
 
+@pytest.mark.slow
 def test_and_where_there_is_no_derivative():
     result = fit(off_in_steps)
     assert squares(result.y, off_in_steps) < 0.01 * squares(np.float32(0), off_in_steps)
 
 
+@pytest.mark.slow
 def test_trees_bounds_and_further_axes():
     """Channels share the support of their cell, and no point outside is ever evaluated."""
     seen = []
@@ -290,6 +292,7 @@ def test_samples_that_fail():
     assert np.all(np.isfinite(error.value.result.y))
 
 
+@pytest.mark.slow
 def test_where_all_ends_fail_the_iterate_stays():
     """At an edge beyond which nothing is finite: most samples are, and no end."""
     y0 = np.full(N, 0.085, np.float32)

@@ -62,6 +62,7 @@ def test_it_is_left_under_optimistix_too(call, solver, fun):
     np.testing.assert_allclose(found.value, BASIN, atol=1e-3)
 
 
+@pytest.mark.slow
 @each
 def test_it_is_left_by_asking_and_telling(call, solver, fun):
     settings = {"key": jax.random.key(0), "bounds": (LOW, HIGH), "residuals": solver.squares}
@@ -175,7 +176,8 @@ def test_a_limit_ends_a_look():
     np.testing.assert_allclose(result.y, BASIN, atol=1e-3)
 
 
-@pytest.mark.parametrize("name", quick_of(["line", "logarithm", "root"], ["line"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["line", "logarithm", "root"])
 def test_a_function_that_falls_for_ever_has_not_converged(name):
     """So far from the start that differences are rounding, a point twice as far is lower."""
     falls = {

@@ -202,6 +202,7 @@ def test_bilateral_keeps_what_is_constant_and_stays_between_the_extremes(body, d
         assert jnp.all((smoothed >= -margin) & (smoothed <= 1 + margin))
 
 
+@pytest.mark.slow
 def test_bilateral_keeps_a_crease_that_the_laplacian_washes_out():
     positions, faces = cube(16)
     guide = jnp.asarray(positions, jnp.float32)

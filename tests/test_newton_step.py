@@ -67,6 +67,7 @@ def test_negative_curvature_leads_down_to_the_radius(fun):
     assert fun(y) < fun(y0)
 
 
+@pytest.mark.slow
 def test_zerograds_descends_by_it():
     solver = sd.ZeroGrads(
         0.3,

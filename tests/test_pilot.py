@@ -119,7 +119,8 @@ def test_bounds_hold():
     assert np.mean(np.all((np.array(seen) > -1) & (np.array(seen) < 2), axis=1)) > 0.9
 
 
-@pytest.mark.parametrize("residuals", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.slow
+@pytest.mark.parametrize("residuals", [False, True])
 def test_a_needle_in_a_box_is_found(residuals):
     """One of 16 points is on it; the start is on the plateau around it."""
     found = 0

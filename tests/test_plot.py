@@ -166,6 +166,7 @@ def test_a_slice_has_the_function_and_the_smoothed_one(ax):
     np.testing.assert_allclose(np.ravel(here), [-1.0, 0.25 + 3 + 7], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_slices_of_all_parameters_in_their_spaces():
     axes = Figure().subplots(1, 5)
     key = jax.random.key(0)
@@ -346,6 +347,7 @@ assert "matplotlib.pyplot" not in sys.modules
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_a_slice_with_leaves_of_two_dtypes(x64, ax):
     y = {"a": jnp.ones(2, jnp.float32), "b": jnp.asarray(2.0, jnp.float64)}
     fun = lambda y, args: jnp.sum(y["a"]).astype(jnp.float64) + y["b"] ** 2

@@ -185,6 +185,7 @@ def test_there_is_always_another_point():
     np.testing.assert_array_equal(search.y, [1, -2])
 
 
+@pytest.mark.slow
 def test_bounds_far_away_change_nothing():
     """Points are told apart by rounding, whose size is not that of the box."""
     valley = lambda y: np.array([10 * (y[1] - y[0] ** 2), 1 - y[0]], np.float32)

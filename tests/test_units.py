@@ -213,7 +213,7 @@ def test_a_parameter_may_change_nothing_at_the_start_alone():
     np.testing.assert_allclose(result.y, [3, 5], atol=5e-3)
 
 
-@pytest.mark.parametrize("n", [2, 3])
+@pytest.mark.parametrize("n", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_bowl_ends_soon_where_rounding_is_all_that_is_left(n):
     """There steps fail that are no longer than the rounding of the parameters."""
     result = sd.minimise(lambda y, args: jnp.sum((y - 3) ** 2), jnp.ones(n), key=jax.random.key(0))
@@ -239,6 +239,7 @@ def test_a_quadratic_ends_soon_after_its_minimum(x64, n, seed):
     assert result.evaluations < found + 20
 
 
+@pytest.mark.slow
 @calls
 def test_a_parameter_that_came_nearer_as_it_failed_goes_no_farther(call):
     """It changes nothing within 0.05, and fails beyond: one step of the other finds the answer."""

@@ -20,7 +20,7 @@ def rippled(y, args):
     return bump(y) - bump(0.3) + 0.5 * ripples
 
 
-@pytest.mark.parametrize("seed", quick_of(range(8), [0, 4]))
+@pytest.mark.parametrize("seed", quick_of(range(8), [4]))
 def test_the_minimum_of_a_ripple_is_not_taken_for_the_answer(seed, x64):
     result = sd.least_squares(
         rippled,
