@@ -53,8 +53,14 @@ def test_a_range_is_known_after_each_of_its_numbers(call, y0):
     assert fun.distinct == 5
 
 
-@pytest.mark.parametrize(("call", "value"), [(sd.minimise, bowl), (sd.least_squares, offsets)])
-@pytest.mark.parametrize("at_once", [1, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("call", "value", "at_once"),
+    [
+        (sd.minimise, bowl, 1),
+        (sd.least_squares, offsets, 1),
+        pytest.param(sd.least_squares, offsets, 4, marks=pytest.mark.slow),
+    ],
+)
 def test_each_point_of_a_grid_is_evaluated_once(call, value, at_once):
     solver = sd.NewtonCG if call is sd.minimise else sd.GaussNewton
     fun = Counted(value)

@@ -221,6 +221,21 @@ def test_a_bowl_ends_soon_where_rounding_is_all_that_is_left(n):
     assert result.evaluations < 25
 
 
+def test_a_bottom_that_is_flat_to_rounding_is_not_left():
+    """The radius grew without end where each check rose, but not as predicted."""
+    seen = []
+
+    def quartic(y):
+        seen.append(float(y[0]))
+        return np.float32(np.sum((y - 0.3) ** 4) + 0.01 * np.sum((y - 0.3) ** 2) - 7)
+
+    box = sd.black_box(quartic, jnp.float32(0))
+    fun = lambda y, args: box(y)
+    result = sd.minimise(fun, jnp.ones(1), key=jax.random.key(0), max_evaluations=130)
+    np.testing.assert_allclose(result.y, 0.3, atol=0.02)
+    assert np.max(np.abs(seen)) < 100
+
+
 SLOW = pytest.mark.slow
 
 

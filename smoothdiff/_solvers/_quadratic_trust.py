@@ -29,6 +29,7 @@ from smoothdiff._solvers._model_check import check_step, is_right
 from smoothdiff._solvers._point_search import nothing
 from smoothdiff._solvers._ratio_test import (
     INSIDE,
+    TELLING,
     asks_nothing,
     lost_in_rounding,
     ratio_test,
@@ -242,7 +243,10 @@ class QuadraticTrust(eqx.Module):
         lower = jnp.minimum(self.radius, length) * jnp.where(long, 0.1, 0.5)
         radius = jnp.where(failed & ~wait, lower, self.radius)
         radius = jnp.where(held, jnp.maximum(radius, 2 * length), radius)
-        radius = jnp.where(proposal.tight & ~self.teaches(), 2 * self.radius, radius)
+        # where a check rose by more than rounding, the radius is not too small to tell
+        tells = funs[0] - before > TELLING * jnp.finfo(fun.dtype).eps * jnp.abs(before)
+        tight = proposal.tight & ~self.teaches() & ~(proposal.check & tells)
+        radius = jnp.where(tight, 2 * self.radius, radius)
         ends = settled(self.settled | proposal.lost, outcome, moved, tried[best])
         return QuadraticTrust(
             metric=metric,
