@@ -17,7 +17,7 @@ from smoothdiff._unit_space import UnitSpace
 # another
 _ENOUGH, _OFTEN = 2, 3
 # after so many answers in a row a search finds nothing that is new
-_IDLE = 1000
+_IDLE = 300
 # bytes of rows that are kept
 _MOST = 2**27
 

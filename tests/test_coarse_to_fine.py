@@ -152,6 +152,7 @@ def test_functions_that_take_a_key_have_fresh_noise_at_all_levels():
     np.testing.assert_allclose(found.y, 1, atol=0.075)
 
 
+@pytest.mark.slow
 def test_a_space_holds_at_all_levels():
     fun = lambda tilt: lambda y, args: jnp.stack([jnp.log10(y[0]) + 2 + tilt, y[1] - 3.0])
     levels = [sd.Level(fun(0.2), 1.0), sd.Level(fun(0.0), 9.0)]

@@ -79,6 +79,7 @@ def test_of_curved_residuals_it_is_that_of_the_jacobian(x64):
     np.testing.assert_allclose(result.covariance, expected(decay, result), rtol=0.01)
 
 
+@pytest.mark.slow
 def test_intervals_are_students(x64):
     result = fitted(line, noisy(line, TRUTH, 1.0))
     for level in (0.95, 0.5):

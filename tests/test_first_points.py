@@ -124,6 +124,7 @@ def test_of_two_sides_those_that_fail_come_nearer_together(count):
     np.testing.assert_allclose(first.reach, [1, 0.1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", quick_of([4, 8], [8]))
 def test_what_runs_beside_first_points_is_new_and_tells_of_no_parameter(count):
     """Along the second parameter alone there are numbers nearby only, and elsewhere everywhere."""

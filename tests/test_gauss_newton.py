@@ -500,6 +500,7 @@ def test_few_samples_of_many_parameters_make_it_better():
     assert result.fun < 0.5 * result.history[0].fun
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parameters", [pytest.param(3, marks=pytest.mark.slow), 24])
 def test_an_unknown_linear_map_is_learnt(parameters):
     """Fewer or more parameters than evaluations in the history, and a side that is closed."""
@@ -641,6 +642,7 @@ def test_solvers_of_optimistix_run_on_a_smoothed_function(solver):
     np.testing.assert_allclose(y, target, atol=1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_wide_samples_stay_wide_along_a_parameter_that_tells_little(seed):
     pixels, n = jnp.linspace(-2.0, 2.0, 64), 3

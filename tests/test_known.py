@@ -75,6 +75,7 @@ def test_each_point_of_a_grid_is_evaluated_once(call, value, at_once):
     assert result.history[-1].step > 1.5 * len(fun.points) / at_once
 
 
+@pytest.mark.slow
 def test_a_function_of_jax_is_known_as_well():
     y0, space = START | {"a": 2}, {"a": sd.Integer(1, 4), "b": sd.Integer(9, 10)}
     fun = lambda y, args: (y["a"] - 3) ** 2 + jnp.sum(y["b"]) - 18
@@ -145,6 +146,7 @@ def test_a_run_goes_on_from_a_checkpoint(tmp_path):
     assert (int(result.y["a"]), result.y["b"].tolist()) == (3, [17, 9])
 
 
+@pytest.mark.slow
 def test_a_run_that_has_ended_takes_no_step_when_it_is_called_again(tmp_path):
     fun = Counted(lambda y: (y[0] - 4) ** 2)
     call = lambda: sd.minimise(
@@ -157,7 +159,7 @@ def test_a_run_that_has_ended_takes_no_step_when_it_is_called_again(tmp_path):
     assert len(fun.points) <= count + 2 + 3
 
 
-@pytest.mark.parametrize("target", [None, -1.0])
+@pytest.mark.parametrize("target", [None, pytest.param(-1.0, marks=pytest.mark.slow)])
 def test_what_fails_always_is_tried_twice(target):
     fun = Counted(lambda y: np.nan if y[0] == 30 else abs(y[0] - 7))
     box = sd.black_box(fun, on_nonfinite="nan")

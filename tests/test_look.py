@@ -191,6 +191,7 @@ def test_a_function_that_falls_for_ever_has_not_converged(name):
         assert found.result != optx.RESULTS.successful
 
 
+@pytest.mark.slow
 def test_a_minimum_far_away_is_found_and_looked_beyond():
     """At 1e6 sigmas it begins anew, and a point beyond is higher; a near one has none."""
     points = []

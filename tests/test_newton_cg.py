@@ -218,6 +218,7 @@ def test_a_saddle_is_left(sigma, seeds, dtype):
         assert distance(np.abs(flat(result.y)), (0, 0.5**0.5)) < 0.03, seed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "y0", quick_of([(0.5, 0.0), (-2.5, 1.7), (2.9, 2.9), (0.0, -2.9)], [(-2.5, 1.7)])
 )

@@ -219,6 +219,7 @@ def spread_gap(y):
     return float(jnp.sum((y - CENTER) ** 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("minimise", "fun", "gap", "solver", "args", "budget", "seeds"),
     [

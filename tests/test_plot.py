@@ -335,6 +335,7 @@ def test_what_errors_refuses(ax):
         sd.plot.errors(np.ones(2), np.ones(2), ["a", "b", "c"], ax=ax)
 
 
+@pytest.mark.slow
 def test_given_axes_need_no_pyplot():
     script = """
 import sys, numpy as np, smoothdiff as sd

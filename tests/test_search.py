@@ -175,6 +175,7 @@ def test_wrong_arguments_are_told_what_to_write(call, error, match):
         call()
 
 
+@pytest.mark.slow
 def test_there_is_always_another_point():
     """Also where the radius has come to nothing, so that a point within it is one that is known."""
     search = sd.Search(jnp.zeros(2), key=KEY)

@@ -63,6 +63,7 @@ def loss(model):
     return np.mean((said @ DRAWING.T - poses @ DRAWING.T) ** 2)
 
 
+@pytest.mark.slow
 def test_a_network_is_trained_without_labels():
     records = []
     result = train(callback=lambda record: records.append(record))

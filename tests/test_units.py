@@ -102,6 +102,7 @@ def test_steps_are_small_in_each_parameter_before_a_run_has_converged(call):
     np.testing.assert_allclose(result.y / FOUND, 1, atol=2e-3)
 
 
+@pytest.mark.slow
 @calls
 @pytest.mark.parametrize("size", [1e-7, 1e-4])
 def test_a_start_far_too_small_is_no_answer(call, size):
