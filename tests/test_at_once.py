@@ -1,5 +1,7 @@
 """Evaluations that run at once: steps at several radii, and points beside the model's step."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -80,7 +82,8 @@ def test_points_beside_a_step_are_within_the_bounds():
 def test_so_many_at_once_solve_a_quadratic_in_fewer_steps(x64, count, residuals):
     bend = jnp.array([[1.0, 0.3, 0.0], [0.0, 2.0, 0.5], [0.0, 0.0, 0.7]])
     rows = lambda y, args: bend @ (y - jnp.array([1.0, -0.5, 2.0]))
-    call, solver = sd.minimise, sd.NewtonCG(0.3, num_samples=count)
+    call: Any = sd.minimise
+    solver: Any = sd.NewtonCG(0.3, num_samples=count)
     fun = lambda y, args: jnp.sum(rows(y, args) ** 2)
     if residuals:
         call, fun, solver = sd.least_squares, rows, sd.GaussNewton(0.3, num_samples=count)
@@ -95,8 +98,10 @@ def test_a_round_of_samples_is_no_smaller_for_few_at_once():
     y = jnp.zeros(3)
     for solver in (sd.NewtonCG, sd.GaussNewton):
         usual = solver(0.1).sizes(y)
+        assert usual is not None
         for count in (1, 2, 3, 16):
             sizes = solver(0.1, num_samples=count).sizes(y)
+            assert sizes is not None
             assert sizes.step == count
             assert sizes.first >= usual.first
             assert sizes.first % count == sizes.later % count == 0

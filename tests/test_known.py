@@ -1,5 +1,7 @@
 """Whole numbers: no point is evaluated again for nothing, and a run ends where all are known."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,7 +24,9 @@ AGAIN = 3 + 3
 class Counted:
     """A black box of whole numbers that keeps its points."""
 
-    def __init__(self, value):
+    value: Any
+
+    def __init__(self, value: Any):
         self.value, self.points = value, []
 
     def __call__(self, y, args):
@@ -174,7 +178,8 @@ def test_numbers_of_different_types_have_names_of_their_own():
         y = {"a": np.uint64(1), "b": np.int64(2)}
         units = UnitSpace.of(y, {"a": sd.Integer(0, 2**50), "b": sd.Integer(0, 9)})
         known, layout = Known.of(units, None), layout_of(units.unit(y))
-        near = [units.unit({"a": a, "b": np.int64(2)}) for a in np.uint64([2**49, 2**49 + 4])]
+        assert known is not None
+        near = [units.unit({"a": np.uint64(a), "b": np.int64(2)}) for a in (2**49, 2**49 + 4)]
         points = jnp.stack([layout.vector(jax.tree.leaves(u)) for u in near])
         known.learn(points, layout, jnp.array([[1.0], [2.0]]))
         known.learn(points, layout, jnp.array([[1.0], [2.0]]))
