@@ -15,7 +15,6 @@ from smoothdiff._call_checks import check_squares
 from smoothdiff._host_function import evaluator, rows_at, traced
 from smoothdiff._host_steps import HostSteps
 from smoothdiff._known import Known
-from smoothdiff._layout import layout_of
 from smoothdiff._problem import Problem, Trial
 from smoothdiff._programs import is_short
 from smoothdiff._solvers._evaluator import Evaluator
@@ -81,8 +80,8 @@ class HostProblem(Problem):
     def resumed(self, state: PointState) -> None:
         """Knows what the search has evaluated."""
         if self.known is not None:
-            history, layout = state.search.history, layout_of(state.progress.lowest_y)
-            self.known.learn(history.points[history.valid], layout, history.rows[history.valid])
+            history = state.search.history
+            self.known.learn(history.points[history.valid], history.rows[history.valid])
 
     def spare(self, y: PyTree, state: PointState) -> int:
         """Of the evaluations for the judgement, those that a function without noise leaves."""
@@ -130,7 +129,7 @@ class HostProblem(Problem):
         if self.known is None:
             return fresh(points)
         rows = self.known.fresh if judging else self.known.rows
-        return rows(points, evaluate.layout, fresh)
+        return rows(points, fresh)
 
     def _answered(self) -> int:
         return 0 if self.known is None else self.known.answered

@@ -7,11 +7,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
-from smoothdiff._layout import Layout
+from smoothdiff._layout import Layout, layout_of
 from smoothdiff._solvers._judgement import ROUNDING
 from smoothdiff._unit_space import UnitSpace
+
+# the rows at points, in units
+Evaluate = Callable[[Float[Array, "k n"]], Float[Array, "k P"]]
 
 # a function has no noise if it had the same value again at so many points, or so often, and never
 # another
@@ -31,9 +34,9 @@ class Known:
     once is tried again, once.
     """
 
-    def __init__(self, units: UnitSpace, count: int):
-        """For a grid of so many points."""
-        self._units, self._count = units, count
+    def __init__(self, units: UnitSpace, layout: Layout, count: int):
+        """For a grid of so many points, whose unit coordinates are vectors of this layout."""
+        self._units, self._layout, self._count = units, layout, count
         self._rows: dict[bytes, np.ndarray] = {}
         self._same: Counter[bytes] = Counter()
         self._failed: set[bytes] = set()
@@ -41,12 +44,12 @@ class Known:
         self.answered = 0
 
     @staticmethod
-    def of(units: UnitSpace, solver: Any) -> "Known | None":
-        """For these parameters, if all are whole numbers, and no devices share out the rows."""
+    def of(units: UnitSpace, y: PyTree[Array], solver: Any) -> "Known | None":
+        """For parameters like `y`, if all are whole numbers, and no devices share out the rows."""
         count = units.count()
         if count is None or getattr(solver, "sharding", None) is not None:
             return None
-        return Known(units, count)
+        return Known(units, layout_of(y), count)
 
     @property
     def complete(self) -> bool:
@@ -63,16 +66,11 @@ class Known:
         enough = len(self._same) >= _ENOUGH or self._same.total() >= _OFTEN
         return enough and not self._noisy
 
-    def rows(
-        self,
-        points: Float[Array, "K n"],
-        layout: Layout,
-        evaluate: Callable[[Float[Array, "k n"]], Float[Array, "k P"]],
-    ) -> Float[Array, "K P"]:
+    def rows(self, points: Float[Array, "K n"], evaluate: Evaluate) -> Float[Array, "K P"]:
         """What the function returns at these points, of which it is evaluated at the others."""
         if not self._sure:
-            return self.fresh(points, layout, evaluate)
-        names = self._names(points, layout)
+            return self.fresh(points, evaluate)
+        names = self._names(points)
         known = lambda i: names[i] in self._rows or names[i] in names[:i]
         new = [i for i in range(len(names)) if not known(i)]
         answered = len(names) - len(new)
@@ -80,26 +78,21 @@ class Known:
         self._idle = 0 if new else self._idle + answered
         found = {}
         if new:
-            rows = self.fresh(points[np.asarray(new)], layout, evaluate)
+            rows = self.fresh(points[np.asarray(new)], evaluate)
             found = {names[i]: row for i, row in zip(new, np.asarray(rows), strict=True)}
         return jnp.asarray(np.stack([found[n] if n in found else self._rows[n] for n in names]))
 
-    def fresh(
-        self,
-        points: Float[Array, "K n"],
-        layout: Layout,
-        evaluate: Callable[[Float[Array, "k n"]], Float[Array, "k P"]],
-    ) -> Float[Array, "K P"]:
+    def fresh(self, points: Float[Array, "K n"], evaluate: Evaluate) -> Float[Array, "K P"]:
         """What the function returns at these points, evaluated at each."""
         rows = evaluate(points)
-        self.learn(points, layout, rows)
+        self.learn(points, rows)
         return rows
 
-    def learn(self, points: Float[Array, "K n"], layout: Layout, rows: Float[Array, "K P"]) -> None:
+    def learn(self, points: Float[Array, "K n"], rows: Float[Array, "K P"]) -> None:
         """Keeps rows that the function returned."""
         if self._noisy:
             return
-        for name, row in zip(self._names(points, layout), np.asarray(rows), strict=True):
+        for name, row in zip(self._names(points), np.asarray(rows), strict=True):
             if not np.all(np.isfinite(row)) and name not in self._failed:
                 self._failed.add(name)
                 continue
@@ -118,7 +111,7 @@ class Known:
             self._noisy = True
             self._rows.clear()
 
-    def _names(self, points: Float[Array, "K n"], layout: Layout) -> list[bytes]:
-        leaves = jax.tree.leaves(self._units.natural(layout.tree(points)))
+    def _names(self, points: Float[Array, "K n"]) -> list[bytes]:
+        leaves = jax.tree.leaves(self._units.natural(self._layout.tree(points)))
         columns = [np.asarray(leaf) for leaf in leaves]
         return [b"".join(column[i].tobytes() for column in columns) for i in range(len(points))]

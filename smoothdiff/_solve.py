@@ -101,7 +101,7 @@ def solve(
         if solver.sizes(y) is None:
             problem = Problem(fun, solver, args, options)
         else:
-            known = None if takes_key else Known.of(units, solver)
+            known = None if takes_key else Known.of(units, y, solver)
             problem = HostProblem.of(fun, solver, args, options, y, known)
         problem, state = _begun(problem, y, kind.check)
     run = Run(problem, y, state, units, _keeps(loop.keep_iterates, y))

@@ -177,14 +177,15 @@ def test_numbers_of_different_types_have_names_of_their_own():
     with jax.enable_x64(True):
         y = {"a": np.uint64(1), "b": np.int64(2)}
         units = UnitSpace.of(y, {"a": sd.Integer(0, 2**50), "b": sd.Integer(0, 9)})
-        known, layout = Known.of(units, None), layout_of(units.unit(y))
+        unit = units.unit(y)
+        known, layout = Known.of(units, unit, None), layout_of(unit)
         assert known is not None
         near = [units.unit({"a": np.uint64(a), "b": np.int64(2)}) for a in (2**49, 2**49 + 4)]
         points = jnp.stack([layout.vector(jax.tree.leaves(u)) for u in near])
-        known.learn(points, layout, jnp.array([[1.0], [2.0]]))
-        known.learn(points, layout, jnp.array([[1.0], [2.0]]))
+        known.learn(points, jnp.array([[1.0], [2.0]]))
+        known.learn(points, jnp.array([[1.0], [2.0]]))
         unused = lambda points: pytest.fail("evaluated again")
-        np.testing.assert_array_equal(known.rows(points, layout, unused), [[1.0], [2.0]])
+        np.testing.assert_array_equal(known.rows(points, unused), [[1.0], [2.0]])
 
 
 @pytest.mark.parametrize("limit", [20, 25])

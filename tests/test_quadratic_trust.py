@@ -47,8 +47,8 @@ REVISE = eqx.filter_jit(QuadraticTrust.revise)
 def propose(trust, history, bounds=None, count=1):
     params = take_apart(jnp.zeros(N), jnp.ones(N), bounds)
     center, _, fun = history.best(jnp.zeros(N))
-    at_once = count, jnp.asarray(0, jnp.int32)
-    return trust.propose(history, center, fun, params, at_once), center, fun
+    zero = jnp.asarray(0, jnp.int32)
+    return trust.propose(history, center, fun, params, count, zero), center, fun
 
 
 def proposal_of(history, radius=10.0, bounds=None, count=1):
@@ -207,7 +207,7 @@ def test_it_works_in_float32_and_under_vmap():
 
     def step(radius):
         trust = QuadraticTrust.start(params.sigma, radius)
-        return trust.propose(history, center, fun, params, (1, jnp.asarray(0, jnp.int32))).points[0]
+        return trust.propose(history, center, fun, params, 1, jnp.asarray(0, jnp.int32)).points[0]
 
     steps = jax.jit(jax.vmap(step))(jnp.array([0.1, 10.0]))
     assert steps.dtype == jnp.float32

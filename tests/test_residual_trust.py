@@ -92,9 +92,7 @@ def known(points):
 
 def propose(trust, history):
     center, row, _ = history.best(jnp.zeros(3))
-    proposal = PROPOSE(
-        trust, history, center, row, jnp.ones(3), NONE, (1, jnp.asarray(0, jnp.int32))
-    )
+    proposal = PROPOSE(trust, history, center, row, jnp.ones(3), NONE, 1, jnp.asarray(0, jnp.int32))
     return proposal, center, row
 
 

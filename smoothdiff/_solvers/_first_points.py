@@ -16,9 +16,9 @@ from jaxtyping import Array, Bool, Float, Int
 # a loss so many times that at the start is far higher; linear residuals that are tried again at the
 # length that is worked out below give at most four times that
 _HIGH = 10.0
-# at so many places a parameter is tried; where no value is finite, here and to the other side, it
+# at so many places a parameter is tried, to both sides of the start; where no value is finite it
 # comes so much nearer, else at most so much
-_PLACES, NEARER, _NEAREST = 4, 0.1, 1e-6
+_PLACES, NEARER, _NEAREST = 2 * 4, 0.1, 1e-6
 # where points are nothing beside others they are tried so many times farther
 FARTHER = 100.0
 # so often a point that fails is evaluated before one that is nearer: it may have failed by chance,
@@ -106,15 +106,17 @@ class FirstPoints(eqx.Module):
         again = ~finite & (left % _CALLS != 1)
         # if the start failed too, nearer is no better
         high = ~(funs <= _HIGH * before) & jnp.isfinite(before) & (before > 0) & ~start & ~again
-        later = jnp.where(high, (left - 1) // _CALLS * _CALLS, 0)
+        # of a point that fails the other side comes before a nearer one
+        was = self.turned[at - 1]
+        turns = high & ~finite & both[at - 1]
+        across = turns & ~was
+        places = (left - 1) // _CALLS - jnp.where(across | was, 0, 1)
+        later = jnp.where(high, jnp.maximum(places, 0) * _CALLS, 0)
         tries = jnp.where(again, left - 1, later)
         nearer = jnp.sqrt(before / jnp.where(finite & high, funs, 1))
-        along = jnp.where(taken & (at > 0), at - 1, len(self.reach))
-        # of a point that fails the other side comes first
-        turns = ~finite & high & (tries > 0) & both[at - 1]
-        turned = self.turned.at[along].set(self.turned[at - 1] ^ turns, mode="drop")
         nearer = jnp.where(finite, jnp.maximum(nearer, _NEAREST), NEARER)
-        nearer = jnp.where(turns & ~self.turned[at - 1], 1, nearer)
-        nearer = jnp.where(high & (tries > 0), nearer, 1)
+        nearer = jnp.where(high & (tries > 0) & ~across, nearer, 1)
+        along = jnp.where(taken & (at > 0), at - 1, len(self.reach))
+        turned = self.turned.at[along].set(was ^ turns, mode="drop")
         left = self.left.at[jnp.where(taken, at, len(self.left))].set(tries, mode="drop")
         return FirstPoints(self.reach.at[along].multiply(nearer, mode="drop"), turned, left, before)

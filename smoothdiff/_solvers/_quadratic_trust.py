@@ -140,11 +140,12 @@ class QuadraticTrust(eqx.Module):
         center: Float[Array, " n"],
         fun: Float[Array, ""],
         params: Params,
-        at_once: tuple[int, Int[Array, ""]],
+        count: int,
+        turn: Int[Array, ""],
     ) -> Proposal:
         """Minimisers of the model within this radius and others, and points that teach it.
 
-        So many `at_once`, after so many others.
+        So many points, after as many evaluations as `turn` says.
         """
         model = least_change(history, center, fun, self.metric, self.radius, self.hessian)
         grad, hessian, (constant, slope, bend) = model.grad, model.hessian, model.polynomial
@@ -152,7 +153,7 @@ class QuadraticTrust(eqx.Module):
         def minimiser(hessian: Array, grad: Array, radius: Array) -> Array:
             return self._within_bounds(hessian, grad, radius, center, params)
 
-        tried = radii(self.radius, at_once[0])
+        tried = radii(self.radius, count)
         steps = jax.vmap(lambda radius: minimiser(hessian, grad, radius))(tried)
         change = lambda steps, slope, bend: (
             dot(steps, slope) + jnp.sum(dot(steps, bend) * steps, axis=1) / 2
@@ -183,7 +184,7 @@ class QuadraticTrust(eqx.Module):
         which = jnp.where(check, 2, self.improve.astype(jnp.int32))
         first = jax.lax.switch(which, [lambda: steps[0], other, checked])
         rise = change(first[None], grad, hessian)[0]
-        points, others = beside(steps.at[0].set(first), steps[0], self.radius, inside, *at_once)
+        points, others = beside(steps.at[0].set(first), steps[0], self.radius, inside, count, turn)
         reduction = reduction.at[0].set(jnp.where(which > 0, 0, reduction[0]))
         poor = (model.farthest > _FAR * self.radius) & (model.used > len(center) + 1)
         # a step that the radius made short may be a first one

@@ -163,7 +163,7 @@ class ResidualSearch(AbstractPointSearch):
             center, row, _ = self.history.best(self.start)
             sides = sides_of(params, center)
             proposal = self.trust.propose(
-                self.history, center, row, sigma, sides, (count, self.evaluated)
+                self.history, center, row, sigma, sides, count, self.evaluated
             )
             return center[None] + sigma[None] * proposal.points, proposal
 

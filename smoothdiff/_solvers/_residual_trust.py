@@ -141,15 +141,16 @@ class TrustRegion(eqx.Module):
         row: Float[Array, " P"],
         sigma: Float[Array, " n"],
         sides: tuple[Array | None, Array | None],
-        at_once: tuple[int, Int[Array, ""]],
+        count: int,
+        turn: Int[Array, ""],
     ) -> Proposal:
         """Minimisers of the model within this radius and others, and points for the geometry.
 
-        So many `at_once`, after so many others.
+        So many points, after as many evaluations as `turn` says.
         """
         jacobian, lacking, poor = self._fit(history, center, row, sigma)
         hessian, grad = dot(jacobian, jacobian.T), dot(jacobian, row)
-        tried = jnp.append(radii(self.radius, at_once[0]), jnp.maximum(self.radius, 1))
+        tried = jnp.append(radii(self.radius, count), jnp.maximum(self.radius, 1))
         steps = jax.vmap(lambda radius: bounded_step(hessian, grad, radius, *sides))(tried)
         change, slope = dot(steps, jacobian), -dot(steps, grad)
         reduction = slope - jnp.sum(change**2, axis=1) / 2
@@ -164,7 +165,7 @@ class TrustRegion(eqx.Module):
         first = steps.at[0].set(jnp.where(improve, other, steps[0]))
         low, high = (None if side is None else side[None] for side in sides)
         inside = lambda ends: jnp.clip(ends, low, high)
-        points, others = beside(first, steps[0], self.radius, inside, *at_once)
+        points, others = beside(first, steps[0], self.radius, inside, count, turn)
         reduction = reduction.at[0].set(jnp.where(improve, 0, reduction[0]))
         return Proposal(points, others, row[None] + change, reduction, slope, ahead, jacobian, poor)
 

@@ -56,9 +56,7 @@ class ValueSearch(ValueState):
 
         def local() -> tuple[Array, Proposal]:
             center, _, fun = self.history.best(self.start)
-            proposal = self.trust.propose(
-                self.history, center, fun, params, (count, self.evaluated)
-            )
+            proposal = self.trust.propose(self.history, center, fun, params, count, self.evaluated)
             return center[None] + self.trust.metric.out(proposal.points), proposal
 
         def wide() -> tuple[Array, Proposal]:
