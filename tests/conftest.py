@@ -1,11 +1,14 @@
 """What every test runs under: strict dtypes and ranks, warnings as errors, x64 off by default."""
 
+import gc
+import math
 import multiprocessing
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
+from pathlib import Path
 
 # a small solve that waits for threads of LAPACK on busy cores takes a hundred times as long
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -44,11 +47,18 @@ OPTIMISED = [
 ]
 
 
+# what is compiled is kept for later modules, until a process has so many bytes
+MEMORY = 3e9
+# how this process compiled for its last module
+FOR: dict[str, bool] = {}
+
+
 def pytest_configure(config):
     """The quick part compiles with few optimisations, `pytest -m slow` some modules with all.
 
     Most of a test is compiling, which takes less than half as long.
     """
+    gc.set_threshold(100_000, 50, 50)  # looking for garbage is a twentieth of the time
     quick = config.option.markexpr != "slow"
     jax.config.update("jax_disable_most_optimizations", quick)
     if quick:  # a tenth of the time goes into the lines of code that XLA's programs would name
@@ -105,10 +115,20 @@ def compiles_quickly(request):
 
 @pytest.fixture(autouse=True, scope="module")
 def forget_compiled(request):
-    """Drops what a module has compiled: kept, it adds up to gigabytes."""
-    jax.config.update("jax_disable_most_optimizations", compiles_quickly(request))
-    yield
-    jax.clear_caches()
+    """Drops what was compiled where it is too much, or of no use to a module."""
+    quickly = compiles_quickly(request)
+    if quickly != FOR.get("quickly", quickly) or memory() > MEMORY:
+        jax.clear_caches()
+    FOR["quickly"] = quickly
+    jax.config.update("jax_disable_most_optimizations", quickly)
+
+
+def memory():
+    """How many bytes this process has, as if too many where the system does not say."""
+    pages = Path("/proc/self/statm")
+    if not pages.exists():
+        return math.inf
+    return int(pages.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 @pytest.fixture

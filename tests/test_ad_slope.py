@@ -59,6 +59,7 @@ def variance(found):
     return sum(float(jnp.sum(jnp.var(leaf, axis=0))) for leaf in jax.tree.leaves(found))
 
 
+@pytest.mark.slow
 def test_it_is_unbiased_and_a_third_as_noisy_as_samples_alone():
     found = grads("ad", keys(2048))
     assert_unbiased(found, jax.grad(exact)(AT), resolution=0.02)

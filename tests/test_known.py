@@ -60,7 +60,7 @@ def test_a_range_is_known_after_each_of_its_numbers(call, y0):
 @pytest.mark.parametrize(
     ("call", "value", "at_once"),
     [
-        (sd.minimise, bowl, 1),
+        pytest.param(sd.minimise, bowl, 1, marks=pytest.mark.slow),
         (sd.least_squares, offsets, 1),
         pytest.param(sd.least_squares, offsets, 4, marks=pytest.mark.slow),
     ],

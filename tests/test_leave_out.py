@@ -248,7 +248,8 @@ COVERAGE = {
 }
 
 
-@pytest.mark.parametrize("name", quick_of(COVERAGE, ["one set"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COVERAGE)
 def test_standard_errors_cover(name):
     """Nominal 95 % t-intervals of value, gradient and a Hessian-vector product over 1,000 keys.
 

@@ -117,6 +117,7 @@ def test_a_good_minimum_costs_two_points_a_parameter_and_one(end):
         assert np.all((looked.min(0) < 0.5) & (looked.max(0) > 0.5))
 
 
+@pytest.mark.slow
 @each
 def test_where_a_bound_is_open_nobody_looks(call, solver, fun):
     points = []

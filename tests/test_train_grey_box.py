@@ -116,6 +116,7 @@ def test_float64(x64):
     assert np.median(result.losses) < 1e-20
 
 
+@pytest.mark.slow
 def test_a_sigma_for_each_parameter_and_a_target():
     result = train(sigma={"x": 0.3, "y": np.array([0.8])}, target=0.5, max_evaluations=4096)
     assert result.reason == "target"

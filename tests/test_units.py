@@ -222,6 +222,7 @@ def test_a_bowl_ends_soon_where_rounding_is_all_that_is_left(n):
     assert result.evaluations < 25
 
 
+@pytest.mark.slow
 def test_a_bottom_that_is_flat_to_rounding_is_not_left():
     """The radius grew without end where each check rose, but not as predicted."""
     seen = []
