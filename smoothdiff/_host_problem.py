@@ -1,5 +1,6 @@
 """A problem whose solver steps point by point: its function is called between compiled parts."""
 
+import contextlib
 import dataclasses
 from collections.abc import Callable
 from functools import partial
@@ -12,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, PyTree
 
 from smoothdiff._call_checks import check_squares
+from smoothdiff._devices import brought, is_moved, on_cpu, where_committed
 from smoothdiff._host_function import evaluator, rows_at, traced
 from smoothdiff._host_steps import HostSteps
 from smoothdiff._known import Known
@@ -24,10 +26,15 @@ from smoothdiff._solvers._random_numbers import in_round, takes_key
 
 
 class HostProblem(Problem):
-    """A problem whose solver steps point by point."""
+    """A problem whose solver steps point by point.
+
+    Its steps may be `moved` to a CPU from the device of the function.
+    """
 
     host: HostSteps
     known: Known | None
+    device: Any = eqx.field(static=True)
+    moved: bool = eqx.field(static=True)
     quick: bool = eqx.field(static=True, default=False)
 
     @staticmethod
@@ -40,14 +47,29 @@ class HostProblem(Problem):
         known: Known | None,
     ) -> "HostProblem":
         """For parameters like `y`, once the values of the solver were looked at."""
-        return HostProblem(fun, solver, args, options, HostSteps.of(solver, options, y), known)
+        device = where_committed(y)
+        moved = is_moved(device) and getattr(solver, "sharding", None) is None
+        with on_cpu() if moved else contextlib.nullcontext():
+            ours = brought((solver, options, y)) if moved else (solver, options, y)
+            host = HostSteps.of(*ours)
+        return HostProblem(fun, solver, args, options, host, known, device, moved)
+
+    def place(self) -> contextlib.AbstractContextManager:
+        """A CPU, if the steps are moved."""
+        return on_cpu() if self.moved else contextlib.nullcontext()
+
+    def here(self, y: PyTree[Array]) -> PyTree[Array]:
+        """As new arrays, if the steps are moved."""
+        with self.place():
+            return brought(y) if self.moved else y
 
     def begin(self, y: PyTree, check: Callable[[PyTree], None]) -> tuple["HostProblem", PointState]:
         """As for any problem, compiled for shapes; and with how well to compile the function."""
         program, out = traced(self.fun, y, self.args)
         check(out)
         quick = is_short(program, self.host.sizes.step)
-        return dataclasses.replace(self, quick=quick), self.host.init(y, out)
+        with self.place():
+            return dataclasses.replace(self, quick=quick), self.host.init(self.here(y), out)
 
     def stage(self, state: PointState) -> int:
         """That of the search."""
@@ -125,7 +147,14 @@ class HostProblem(Problem):
         self, evaluate: Evaluator, points: Array, at_once: int, judging: bool = False
     ) -> Array:
         """What the function returns at points, so many at once, unless it is known."""
-        fresh = lambda points: rows_at(evaluate, points, at_once, self.quick)
+
+        def fresh(points: Array) -> Array:
+            if not self.moved:
+                return rows_at(evaluate, points, at_once, self.quick)
+            with jax.default_device(self.device):
+                rows = rows_at(evaluate, points, at_once, self.quick)
+            return brought(rows)
+
         if self.known is None:
             return fresh(points)
         rows = self.known.fresh if judging else self.known.rows

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+from smoothdiff._devices import default_platform
 from smoothdiff._flat import Flat
 from smoothdiff._programs import QUICKLY
 from smoothdiff._solvers._base import smoothed_params
@@ -151,6 +152,6 @@ _QUICKLY = [
 
 
 def _compiled(state: PointState) -> list[Callable]:
-    """The parts for a history of this size."""
+    """The parts for a history of this size, where new arrays are."""
     short = state.search.history.rows.size < _SHORT
-    return _QUICKLY if short and jax.default_backend() == "cpu" else _WELL
+    return _QUICKLY if short and default_platform() == "cpu" else _WELL

@@ -1,5 +1,6 @@
 """What the steps of a run have in common: the function, the solver and its methods, compiled."""
 
+import contextlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -33,6 +34,14 @@ class Problem(eqx.Module):
     @eqx.filter_jit
     def value(self, y: PyTree) -> PyTree[Array]:
         return self._fn(y, self.args)[0]
+
+    def place(self) -> contextlib.AbstractContextManager:
+        """Within this context new arrays are where the steps are."""
+        return contextlib.nullcontext()
+
+    def here(self, y: PyTree[Array]) -> PyTree[Array]:
+        """Parameters where the steps are."""
+        return y
 
     def begin(self, y: PyTree, check: Callable[[PyTree], None]) -> tuple["Problem", Any]:
         """What the steps are taken with, and the first state.

@@ -5,6 +5,8 @@ import math
 import jax
 from jax.extend.core import ClosedJaxpr, Jaxpr
 
+from smoothdiff._devices import default_platform
+
 # half of the time of compiling is saved, and a program takes two to three times as long
 QUICKLY = {"xla_backend_optimization_level": 0}
 # a program that reads and writes fewer numbers takes less than a millisecond, host functions apart
@@ -13,7 +15,7 @@ _SHORT = 100_000
 
 def is_short(program: ClosedJaxpr, times: int = 1) -> bool:
     """Whether a program is short on the CPU, so many times at once; with a loop it never is."""
-    return jax.default_backend() == "cpu" and times * _numbers(program.jaxpr) < _SHORT
+    return default_platform() == "cpu" and times * _numbers(program.jaxpr) < _SHORT
 
 
 def _numbers(jaxpr: Jaxpr) -> float:

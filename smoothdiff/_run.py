@@ -78,7 +78,7 @@ class Run:
         fewer = count - self.problem.spare(self.y, self.state)
         later = limits.reached(self.steps, fewer, seconds, lowest)
         if later is None and self.trial is None:
-            with reraise():
+            with reraise(), self.problem.place():
                 self.trial = jax.block_until_ready(self.problem.trial(self.y, self.state))
         return reason if self.trial is None or self.trial.noisy else later
 
@@ -98,7 +98,8 @@ class Run:
         iterate = self.units.natural(self.y) if self.keep_iterates else None
         saved = file.load((self.y, self.state, Record(0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, iterate)))
         if saved is not None:
-            self.y, self.state = jax.tree.map(jnp.asarray, saved[:2])
+            with problem.place():
+                self.y, self.state = jax.tree.map(jnp.asarray, saved[:2])
             self.history = _unstack(saved[2])
             self.start -= self.history[-1].seconds
             self._check_function(file)
@@ -150,11 +151,16 @@ class Run:
     def done(self) -> str | None:
         """Why the solver wants to stop, if it does."""
         if self.stopped is None:
-            self.stopped = self.problem.done(self.y, self.state)
+            with self.problem.place():
+                self.stopped = self.problem.done(self.y, self.state)
         return self.problem.reason(self.state) if self.stopped else None
 
     def step(self) -> Record:
         """Takes a step and keeps it, unless it failed."""
+        with self.problem.place():
+            return self._step()
+
+    def _step(self) -> Record:
         with reraise():
             y, state, stopped = jax.block_until_ready(self.problem.step(self.y, self.state))
         progress = state.progress
@@ -181,7 +187,7 @@ class Run:
 
     def judged(self, reason: str) -> Result:
         """The result of a run that ended well."""
-        with reraise():
+        with reraise(), self.problem.place():
             judged = self.problem.judge(self.y, self.state, self.trial)
             y, stats = jax.block_until_ready(judged)
         # a last batch that fails costs no more than the smoothed value

@@ -10,6 +10,7 @@ from jaxtyping import Array, PyTree
 
 from smoothdiff._call_checks import check_bounds, check_squares, check_start
 from smoothdiff._default_solver import default_solver, share_of_range
+from smoothdiff._devices import brought, computed_on_cpu
 from smoothdiff._host_steps import HostSteps
 from smoothdiff._layout import layout_of
 from smoothdiff._params import as_key
@@ -72,6 +73,7 @@ class Search:
     Source: own.
     """
 
+    @computed_on_cpu
     def __init__(
         self,
         y0: PyTree,
@@ -91,7 +93,7 @@ class Search:
             bounds = units.bounds()
             if solver is None and sigma is None:
                 sigma = units.sigma(share_of_range(units.unit(y0), residuals))
-        self._y = self._unit(y0)
+        self._y = brought(self._unit(y0))
         if solver is None:
             solver = default_solver(self._y, bounds, sigma, residuals)
         if not isinstance(solver, AbstractSmoothSolver) or solver.sizes(self._y) is None:
@@ -106,7 +108,7 @@ class Search:
         self.solver: Any = solver
         options = write_options(key, bounds, takes_key)
         self._key, self._takes_key = as_key(key), takes_key
-        self._steps = HostSteps.of(solver, options, self._y)
+        self._steps = HostSteps.of(*brought((solver, options, self._y)))
         self._layout, self._random = layout_of(self._y), np.random.default_rng(0)
         self._size: int | None = None
         self._over = False
@@ -132,6 +134,7 @@ class Search:
         return self._state.progress.evaluations.item() + len(self._came)
 
     @property
+    @computed_on_cpu
     def key(self) -> Array:
         """For a function that draws random numbers: those of the points that are asked for next.
 
@@ -146,6 +149,7 @@ class Search:
         """Whether the solver would stop here; more can be asked for."""
         return self._over
 
+    @computed_on_cpu
     def ask(self, count: int = 1) -> list[PyTree[np.ndarray]]:
         """The next points to evaluate, so many of them."""
         late = self.evaluations - _SOME - _LOST * len(self._out)
@@ -162,6 +166,7 @@ class Search:
                 break
         return given
 
+    @computed_on_cpu
     def tell(self, points: Sequence[PyTree], values: Sequence[Any]) -> None:
         """The values at these points; NaN for an evaluation that failed.
 

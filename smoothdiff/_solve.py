@@ -104,7 +104,7 @@ def solve(
             known = None if takes_key else Known.of(units, y, solver)
             problem = HostProblem.of(fun, solver, args, options, y, known)
         problem, state = _begun(problem, y, kind.check)
-    run = Run(problem, y, state, units, _keeps(loop.keep_iterates, y))
+    run = Run(problem, problem.here(y), state, units, _keeps(loop.keep_iterates, y))
     try:
         if loop.checkpoint is not None:
             run.attach(loop.checkpoint)

@@ -1,0 +1,73 @@
+"""Where the steps of a search point by point are computed: on a CPU, wherever its function is.
+
+A step is hundreds of small operations. A GPU must be told of each, which takes longer than all of
+them on a CPU, and so does compiling for it.
+"""
+
+import contextlib
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+
+def default_platform() -> str:
+    """That of the device where JAX puts new arrays."""
+    device = jax.config.jax_default_device
+    return jax.default_backend() if device is None else getattr(device, "platform", device)
+
+
+def is_moved(device: Any) -> bool:
+    """Whether steps are on a CPU though the function runs elsewhere, on this device."""
+    platform = default_platform() if device is None else getattr(device, "platform", device)
+    return platform != "cpu" and jax.process_count() == 1 and _cpu() is not None
+
+
+def where_committed(tree: PyTree) -> Any:
+    """The device that someone chose for these arrays, else the one where JAX puts new arrays."""
+    for leaf in jax.tree.leaves(tree):
+        if isinstance(leaf, jax.Array) and leaf.committed:
+            return next(iter(leaf.devices()))
+    return jax.config.jax_default_device
+
+
+def on_cpu() -> contextlib.AbstractContextManager:
+    """Within this context new arrays are on a CPU, if JAX has one."""
+    cpu = None if default_platform() == "cpu" else _cpu()
+    return contextlib.nullcontext() if cpu is None else jax.default_device(cpu)
+
+
+def computed_on_cpu(method: Callable) -> Callable:
+    """The method with its new arrays on a CPU."""
+
+    @functools.wraps(method)
+    def on_a_cpu(*args: Any, **options: Any) -> Any:
+        with on_cpu():
+            return method(*args, **options)
+
+    return on_a_cpu
+
+
+def brought(tree: PyTree) -> PyTree:
+    """The same with new arrays here, which go wherever they are wanted."""
+    return jax.tree.map(_brought, tree)
+
+
+def _brought(leaf: Any) -> Any:
+    if not isinstance(leaf, jax.Array):
+        return leaf
+    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        data = _brought(jax.random.key_data(leaf))
+        return jax.random.wrap_key_data(data, impl=jax.random.key_impl(leaf))
+    return jnp.asarray(np.asarray(leaf))
+
+
+def _cpu() -> Any:
+    try:
+        return jax.local_devices(backend="cpu")[0]
+    except RuntimeError:
+        return None
