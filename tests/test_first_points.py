@@ -59,6 +59,18 @@ def test_of_a_point_that_fails_the_other_side_comes_first(x64):
     np.testing.assert_allclose(seen, [1, 1, 1, -1, -1, 0.1, 0.1, -0.1, -0.1], rtol=1e-6)
 
 
+def test_a_loss_that_is_high_on_the_other_side_is_tried_nearer_there_as_often():
+    """And another search begins with the first side again."""
+    first, seen = FirstPoints.start(jnp.zeros(1)), []
+    for fun in [1.0, np.inf, np.inf, *8 * [1e6]]:
+        if first.done():
+            break
+        seen.append(float(jnp.where(first.turned, -1, 1)[0] * first.reach[0]))
+        first = first.after(jnp.array([fun]), jnp.ones(1, bool))
+    np.testing.assert_allclose(seen, [1, 1, 1, -1, -1e-3, -1e-6, -1e-9], rtol=1e-5)
+    assert not first.around(jnp.ones(())).turned[0]
+
+
 @pytest.mark.parametrize("bounds", [None, (-2.0, 4.0)])
 def test_a_start_at_the_edge_of_where_it_fails_is_left(bounds):
     """Half of the first points fail, however near they are."""

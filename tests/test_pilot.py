@@ -102,6 +102,7 @@ def test_what_is_the_same_everywhere_is_left_alone_in_the_end():
     assert result.evaluations < 120
 
 
+@pytest.mark.slow
 def test_bounds_hold():
     seen = []
 

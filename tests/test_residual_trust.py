@@ -107,14 +107,14 @@ def test_directions_that_no_point_has_keep_the_old_jacobian(x64):
     history = known([[0, 0, 0], [1.0, 0, 0]])
     old = np.ones((3, 7))
     trust = TrustRegion.start(jnp.asarray(1.0), 3, 7)
-    trust = TrustRegion(trust.radius, jnp.asarray(old), *jax.tree.leaves(trust)[2:])
+    trust = eqx.tree_at(lambda t: t.jacobian, trust, jnp.asarray(old))
     proposal, *_ = propose(trust, history)
     np.testing.assert_allclose(proposal.jacobian[0], JACOBIAN[0], atol=1e-6)
     np.testing.assert_allclose(proposal.jacobian[1:], old[1:], atol=1e-6)
     assert proposal.poor
 
 
-def outcome(fun, trust=None, predicted=0.5, ahead=0.0):
+def outcome(fun, trust=None, predicted=0.5, ahead=0.0, check=False):
     """The region after a step of length one from 1, where half of that was predicted."""
     one = jnp.ones((1, 1))
     proposal = Proposal(
@@ -126,6 +126,7 @@ def outcome(fun, trust=None, predicted=0.5, ahead=0.0):
         ahead=jnp.asarray(ahead),
         jacobian=one,
         poor=jnp.asarray(False),
+        check=jnp.asarray(check),
     )
     trust = trust or TrustRegion.start(jnp.asarray(1.0), 1, 1)
     row = jnp.full((1, 1), fun)
@@ -139,6 +140,25 @@ def test_the_radius_follows_the_acceptance_ratio():
     assert outcome(50.0).radius == pytest.approx(0.1)
     for anything in (jnp.nan, jnp.inf):
         assert outcome(anything).radius == pytest.approx(0.1)
+
+
+def test_a_check_says_whether_the_model_is_right_or_is_followed_by_another():
+    """The model promises nothing, and predicts residuals of 2 where there were 1."""
+    before = TrustRegion.start(jnp.asarray(1.0), 1, 1)
+    checked = lambda there: outcome(there, before, predicted=jnp.asarray(2.0), check=True)
+    right = checked(2.05)
+    assert right.right
+    assert right.settled
+    assert float(right.radius) == 1
+    for wrong in (2.2, 1.5, jnp.nan):  # nearer
+        assert not checked(wrong).right
+        assert float(checked(wrong).radius) == 0.5
+    little = checked(1.00001)  # farther
+    assert not little.right
+    assert float(little.radius) == 4
+    plateau = checked(1.0)  # as before
+    assert not plateau.right
+    assert float(plateau.radius) == 0.5
 
 
 def test_a_radius_that_is_too_small_for_a_promise_is_no_convergence():

@@ -4,10 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
 import smoothdiff as sd
 from smoothdiff._params import take_apart
+from smoothdiff._solvers._history import History
 from smoothdiff._solvers._ratio_test import is_lower, rounding_alone
+from smoothdiff._solvers._residual_search import ResidualSearch
 from tests.parts import quick_of
 
 PIXELS = np.linspace(0, 1, 32)
@@ -20,7 +23,8 @@ def rippled(y, args):
     return bump(y) - bump(0.3) + 0.5 * ripples
 
 
-@pytest.mark.parametrize("seed", quick_of(range(8), [4]))
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(8))
 def test_the_minimum_of_a_ripple_is_not_taken_for_the_answer(seed, x64):
     result = sd.least_squares(
         rippled,
@@ -95,3 +99,83 @@ def test_samples_are_reflected_at_bounds(bounds):
     np.testing.assert_array_equal(params.reflected(beyond), [0.125, 0.75])
     far = params.reflected(jnp.array([-7.0, 30.0]))
     assert np.all((far >= bounds[0]) & (far <= bounds[1]))
+
+
+def searched(dtype):
+    """A search of three parameters that has evaluated its start, of value 1."""
+    state = ResidualSearch.of(jnp.zeros(3, dtype), History.empty(20, 3, 1, dtype))
+    return lowered(state, 1.0, 0)
+
+
+def lowered(search, value, count):
+    new = History(*(jnp.full(s, value, search.mark.dtype) for s in ((1, 3), (1, 1), (1,))), ONE)
+    return search.kept(new).marked(count)
+
+
+ONE = jnp.ones(1, bool)
+
+
+@pytest.mark.parametrize(("dtype", "little"), [(jnp.float32, 3e-6), (jnp.float64, 3e-9)])
+def test_what_falls_little_by_little_is_no_sign_of_an_end_unless_all_is_rounding(
+    dtype, little, x64
+):
+    search = searched(dtype)
+    assert (int(search.stale), float(search.mark)) == (0, 1)
+    stale = []
+    for step in range(1, 5):
+        search = lowered(search, 1 - little * step, 1)
+        stale.append(int(search.stale))
+    # a third of what is noticeable each
+    assert stale == [1, 2, 0 if dtype == jnp.float32 else 3, 1 if dtype == jnp.float32 else 0]
+    search = lowered(search, 2.0, 5)
+    assert int(search.stale) == stale[-1] + 5
+
+
+def test_evaluations_that_are_told_end_no_search():
+    fun = lambda y: float(np.sum((np.asarray(y) - 1) ** 2))
+    told = 3 * jax.random.normal(jax.random.key(1), (200, 2))
+    told = sorted(told, key=fun)
+    search = sd.Search(jnp.zeros(2), key=jax.random.key(0), solver=sd.NewtonCG(0.5, restarts=1))
+    search.tell(told, [fun(y) for y in told])
+    for _ in range(12):
+        points = search.ask(1)
+        search.tell(points, [fun(y) for y in points])
+    assert not search.done
+    assert int(search._state.restarts) == 1
+    assert search.fun < 1e-6
+
+
+TIMES = np.linspace(0, 3, 40)
+NOISE = 0.05 * np.random.default_rng(0).standard_normal(40)
+FITS = {
+    "line": (1, 12, lambda y, t: y[0] * t - 0.7 * t),
+    "polynomial": (5, 24, lambda y, t: jnp.polyval(y, t, unroll=5) - jnp.cos(t)),
+    "decay": (2, 50, lambda y, t: y[0] * jnp.exp(-y[1] * t) - 2 * jnp.exp(-0.7 * t)),
+}
+
+
+@pytest.mark.parametrize("dtype", quick_of([jnp.float32, jnp.float64], [jnp.float64]))
+@pytest.mark.parametrize("fit", quick_of(FITS, ["polynomial"]))
+def test_a_fit_of_noisy_data_ends_soon_after_its_minimum(fit, dtype, x64):
+    """The model asks for nothing, and is right about points beside: no more is needed."""
+    n, most, curve = FITS[fit]
+    times, noise = jnp.asarray(TIMES, dtype), jnp.asarray(NOISE, dtype)
+    for seed in range(3):
+        key = jax.random.key(seed)
+        y0 = jax.random.uniform(key, (n,), dtype) + jnp.asarray(0.3, dtype)
+        result = sd.least_squares(lambda y, args: curve(y, times) + noise, y0, key=key)
+        assert result.reason == "converged"
+        assert result.evaluations < most
+        best = minimize(lambda y: np.sum((curve(y, TIMES) + NOISE) ** 2) / 2, np.asarray(y0, float))
+        assert result.fun < best.fun * (1 + 1e-5)
+
+
+@pytest.mark.slow
+def test_so_many_evaluations_at_once_end_a_search_after_a_few_steps():
+    """Not after one that is no lower, and not never."""
+    solver, key = sd.NewtonCG(0.5, num_samples=64), jax.random.key(0)
+    bowl = lambda y, args: jnp.sum((y - 1) ** 2) + 1
+    result = sd.minimise(bowl, jnp.zeros(1), key=key, solver=solver, max_evaluations=2000)
+    assert result.reason in ("converged", "stalled")
+    assert result.fun == 1
+    assert 5 <= len(result.history) < 20

@@ -29,6 +29,8 @@ _CALLS = 2
 class FirstPoints(eqx.Module):
     """What is still to be evaluated: `left` counts the calls for the start and for each point.
 
+    A point may have twice as many at each distance, for both sides; one side uses up those of both.
+
     There are as many points for each parameter, one after the other. `reach` is the length of the
     step along each parameter, in units of its sigma, which may have `turned` to the other side.
     `before` is the loss at the start, by which `after` tells what is high; with `known` a point has
@@ -50,7 +52,7 @@ class FirstPoints(eqx.Module):
     def around(self, fun: Float[Array, ""]) -> "FirstPoints":
         """All parameters again, from a point with this loss."""
         left = jnp.full_like(self.left, _PLACES * _CALLS).at[0].set(0)
-        return FirstPoints(self.reach, self.turned, left, fun)
+        return FirstPoints(self.reach, jnp.zeros_like(self.turned), left, fun)
 
     def again(self, which: Bool[Array, " n"], factor: float | Array) -> "FirstPoints":
         """These parameters once more, so many times as far away, all or each."""
@@ -108,10 +110,11 @@ class FirstPoints(eqx.Module):
         high = ~(funs <= _HIGH * before) & jnp.isfinite(before) & (before > 0) & ~start & ~again
         # of a point that fails the other side comes before a nearer one
         was = self.turned[at - 1]
-        turns = high & ~finite & both[at - 1]
+        rest = (left - 1) // _CALLS
+        turns = high & ~finite & both[at - 1] & (rest > 0)
         across = turns & ~was
-        places = (left - 1) // _CALLS - jnp.where(across | was, 0, 1)
-        later = jnp.where(high, jnp.maximum(places, 0) * _CALLS, 0)
+        # a nearer one takes up what the other side has left at this distance
+        later = jnp.where(high, jnp.where(across, rest, rest // 2 * 2) * _CALLS, 0)
         tries = jnp.where(again, left - 1, later)
         nearer = jnp.sqrt(before / jnp.where(finite & high, funs, 1))
         nearer = jnp.where(finite, jnp.maximum(nearer, _NEAREST), NEARER)

@@ -31,9 +31,9 @@ from smoothdiff._solvers._random_numbers import in_step, takes_key
 from smoothdiff._solvers._ratio_test import taken_by_rounding
 from smoothdiff._solvers._stages import Sizes, where
 
-# by default a search ends after so many evaluations for each parameter, and one, without a lower
-# point
-PATIENCE = 20
+# by default a search ends after so many evaluations for each parameter, and one, that did not lower
+# the function, and after no fewer steps than that
+_PATIENCE, _STEPS = 20, 5
 # values that are the same at points further apart than so many roots of the rounding: a plateau
 _PLATEAU = 3
 # of the last evaluations, at least so many, one must be finite where others may be dropped
@@ -58,6 +58,11 @@ class PointState(eqx.Module):
         """The evaluations of the search that went lowest, of equals the last, as the answer is."""
         here, before = self.search.history, self.found
         return here if before is None else where(before.went_lower(here), before, here)
+
+
+def patience(n: int, num_samples: int | None) -> int:
+    """The default, in evaluations."""
+    return max(_PATIENCE * (n + 1), _STEPS * (num_samples or 1))
 
 
 def final_evaluations(candidates: int) -> int:
@@ -176,8 +181,8 @@ class PointStep(eqx.Module):
         looking = search.is_looking()
         checks = small & (search.small == 0) & ~after.right() & ~looking
         # points anywhere are no steps
-        teaches, lower = search.checking() | looking, lower & ~looking
-        after = after.counted(small | looking, teaches, lower, least, sizes.step)
+        teaches = search.checking() | looking
+        after = after.counted(small | looking, teaches, least, sizes.step)
         after = where(checks, after.checked(), after).looking(params, sizes, least)
         # the end of a step that is tried may be anything, and so may a place that nobody asked for
         later = state.restarts < solver.restarts
@@ -227,13 +232,12 @@ class PointStep(eqx.Module):
         state, params = self.state, self.params()
         progress, search = state.progress, state.search
         new = self._new(points, rows)
-        search = search.kept(new)
+        # nobody asked for them, so they are no sign of a search that leads nowhere
+        search = search.kept(new).marked(0)
         point, fun = lowest(points, jnp.where(new.valid, new.funs, jnp.inf))
-        lower, count = fun < progress.lowest_fun, len(points)
-        search = eqx.tree_at(lambda s: s.stale, search, jnp.where(lower, 0, search.stale + count))
         seen = Seen(params.layout.tree(point), fun)
-        rest = progress.smoothed, progress.stderr, progress.sigma, count, progress.finite, seen
-        progress = progress.after(self.y, *rest)
+        same = progress.smoothed, progress.stderr, progress.sigma
+        progress = progress.after(self.y, *same, len(points), progress.finite, seen)
         return dataclasses.replace(state, progress=progress, search=search)
 
     def over(self) -> Bool[Array, ""]:

@@ -16,7 +16,7 @@ from smoothdiff._solvers._first_points import FirstPoints
 from smoothdiff._solvers._history import History, hardly_differ
 from smoothdiff._solvers._look import Look
 from smoothdiff._solvers._pilot import Pilot
-from smoothdiff._solvers._ratio_test import is_lower
+from smoothdiff._solvers._ratio_test import is_lower, is_noticeable
 from smoothdiff._solvers._stages import FIRST, LOOK, PILOT, TRUST, Sizes, where
 
 # so many small steps in a row count as convergence
@@ -35,8 +35,9 @@ class AbstractPointSearch(eqx.Module):
     It begins with the `first` points. Where they hardly differ, the `pilot` follows, and the first
     points again if it found something else. There may be a `look` before the end.
 
-    `evaluated` counts the evaluations, `small` the small steps in a row, `stale` the evaluations
-    since the last lower point. There is an `average` if the function takes random numbers.
+    `evaluated` counts the evaluations, `small` the small steps in a row. The `mark` is the lowest
+    value when it last fell noticeably, and `stale` counts the evaluations since.
+    There is an `average` if the function takes random numbers.
     """
 
     stage: Int[Array, ""]
@@ -46,6 +47,7 @@ class AbstractPointSearch(eqx.Module):
     evaluated: Int[Array, ""]
     small: Int[Array, ""]
     stale: Int[Array, ""]
+    mark: Float[Array, ""]
     pilot: Pilot
     average: Average | None
     look: Look | None
@@ -112,10 +114,7 @@ class AbstractPointSearch(eqx.Module):
         """Whether a short step is a sign of convergence."""
 
     def right(self) -> Bool[Array, ""]:
-        """Whether the last point was a check, and the local model was right about it.
-
-        Never for residuals: errors of parameters take evaluations around the answer.
-        """
+        """Whether the last point was a check, and the local model was right about it."""
         return jnp.asarray(False)
 
     def over(self, sizes: Sizes) -> Bool[Array, ""]:
@@ -173,16 +172,23 @@ class AbstractPointSearch(eqx.Module):
         """With such a check next, if the local model has any."""
         return self
 
-    def counted(self, small: Array, check: Array, lower: Array, least: Array, count: int) -> Any:
+    def counted(self, small: Array, check: Array, least: Array, count: int) -> Any:
         """With a small step more or less, and so many evaluations; `least` is as low as can be.
 
         A `check` that comes true is no step.
         """
         small = jnp.where(small, jnp.where(check, self.small, self.small + 1), 0)
         small = jnp.where(least, _SMALL, small)
-        stale = jnp.where(lower, 0, self.stale + count)
-        counts = self.evaluated + count, small, stale
-        return eqx.tree_at(lambda s: (s.evaluated, s.small, s.stale), self, counts)
+        counts = self.evaluated + count, small
+        counted = eqx.tree_at(lambda s: (s.evaluated, s.small), self, counts)
+        return counted.marked(count)
+
+    def marked(self, count: int) -> Any:
+        """With so many evaluations that may have lowered the function, also little by little."""
+        fun = self.history.best(self.start)[2]
+        lower = jnp.any(self.history.valid) & is_noticeable(self.mark - fun, fun)
+        waited = jnp.where(lower, 0, self.stale + count), jnp.where(lower, fun, self.mark)
+        return eqx.tree_at(lambda s: (s.stale, s.mark), self, waited)
 
     def kept(self, new: History) -> Any:
         """With these evaluations in the history instead of the oldest."""

@@ -219,7 +219,9 @@ class QuadraticTrust(eqx.Module):
         funs = jnp.where(good & ~proposal.others, funs, jnp.inf)
         best = jnp.argmin(funs)
         # what rounding may do says nothing against the model
-        fun, reduction = funs[best], jnp.where(proposal.lost, 0, proposal.reduction[best])
+        fun, promise = funs[best], proposal.reduction[best]
+        little = proposal.lost | ~(promise > jnp.finfo(fun.dtype).eps * jnp.abs(before))
+        reduction = jnp.where(little, 0, promise)
         hessian = proposal.hessian
         metric, turn = self.metric.adapted(
             lambda v: dot(hessian, v), jnp.diagonal(hessian), jnp.zeros_like(fun)

@@ -16,6 +16,8 @@ _NOTHING, TELLING = 8, 1000
 # a step of so many roundings of the parameters may be lost in those of the function's own sums; in
 # float32 that would be too long a step to do without
 _LOST = {"float32": 8, "float64": 64}
+# a reduction of a smaller share of the value is no progress, nor one of few roundings
+_PROGRESS = 1e-8
 # points are near each other within so many sigmas
 _NARROW = 1e-3
 
@@ -88,6 +90,12 @@ def lost_in_rounding(move: Float[Array, " n"], center: Float[Array, " n"]) -> Bo
 def is_lower(fun: Float[Array, ""], before: Float[Array, ""]) -> Bool[Array, ""]:
     """Whether a value is lower than another by more than rounding."""
     return before - fun > _NOTHING * jnp.finfo(fun.dtype).eps * jnp.abs(before)
+
+
+def is_noticeable(reduction: Float[Array, ""], fun: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether a reduction to this value, in many evaluations, is any progress."""
+    share = max(_PROGRESS, _NOTHING * _NOTHING * float(jnp.finfo(fun.dtype).eps))
+    return reduction > share * jnp.abs(fun)
 
 
 def are_level(funs: Float[Array, " K"], valid: Bool[Array, " K"]) -> Bool[Array, ""]:

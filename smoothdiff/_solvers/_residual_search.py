@@ -56,6 +56,7 @@ class ResidualSearch(AbstractPointSearch):
             wide=Wide.start(theta, jnp.zeros(size, theta.dtype), jnp.ones_like(theta)),
             small=none,
             stale=none,
+            mark=jnp.full_like(one, jnp.inf),
             pilot=Pilot.start(theta),
             average=None,
             look=None,
@@ -94,15 +95,17 @@ class ResidualSearch(AbstractPointSearch):
         """The local model's may be none."""
         return ~self.is_local() | self.trust.settled
 
+    def right(self) -> Bool[Array, ""]:
+        """The local model alone has checks."""
+        return self.is_local() & self.trust.right
+
     def lost(self, sizes: Sizes) -> Bool[Array, ""]:
-        """Whether it converged, or so many evaluations in a row were no lower."""
+        """Whether it converged, or so many evaluations in a row were hardly lower."""
         return self.converged() | (self.stale >= sizes.patience)
 
-    def counted(
-        self, small: Array, check: Array, lower: Array, least: Array, count: int
-    ) -> "ResidualSearch":
+    def counted(self, small: Array, check: Array, least: Array, count: int) -> "ResidualSearch":
         """Before the minimum of a ripple is taken for the answer, wide rounds look around once."""
-        after = super().counted(small, check, lower, least, count)
+        after = super().counted(small, check, least, count)
         unseen = (self.wide.rounds == 0) & self.is_local() & self.trust.of_ripple()
         doubt = after.converged() & unseen & self._much() & ~least
         around = after._to_wide(jnp.ones_like(self.wide.scale))

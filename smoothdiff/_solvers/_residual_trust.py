@@ -19,7 +19,7 @@ from smoothdiff._products import dot
 from smoothdiff._solvers._at_once import beside, radii
 from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._history import History
-from smoothdiff._solvers._ratio_test import ratio_test, settled, taken_by_rounding
+from smoothdiff._solvers._ratio_test import TELLING, ratio_test, settled, taken_by_rounding
 
 # evaluations that a fit may use for each parameter, and how far they count, in radii
 _USED, _REACH, _FARTHEST = 3, 1.5, 2.0
@@ -27,6 +27,10 @@ _USED, _REACH, _FARTHEST = 3, 1.5, 2.0
 _RIDGE = 1e-8
 # the radius grows only if the change of the residuals was predicted with an error below this share
 _PREDICTED = 0.5
+# a model is right about a check whose change it predicted with an error below this share
+_RIGHT = 0.1
+# a check that changes hardly anything is followed by one so many times as far away
+_FARTHER = 4.0
 # a direction with less than this share of the radius is not covered by evaluations
 _COVERED = 0.2
 # ... and evaluations cover the region, or this share of what the fit uses
@@ -50,8 +54,9 @@ _SHORTER, _SMOOTH = 0.6, 0.8
 class Proposal(NamedTuple):
     """Points to evaluate, in units of sigma, and what the model says of them.
 
-    The `others` are no steps, see `beside`. A step of one sigma, or as long as the radius if that
-    is more, would reduce the loss by what is `ahead`.
+    The `others` are no steps, see `beside`. The first is a `check` where the model asks for
+    nothing. A step of one sigma, or as long as the radius if that is more, would reduce the loss by
+    what is `ahead`.
     """
 
     points: Float[Array, "K n"]
@@ -62,6 +67,7 @@ class Proposal(NamedTuple):
     ahead: Float[Array, ""]
     jacobian: Float[Array, "n P"]
     poor: Bool[Array, ""]
+    check: Bool[Array, ""]
 
 
 class TrustRegion(eqx.Module):
@@ -72,8 +78,8 @@ class TrustRegion(eqx.Module):
     one before and predicted no better, as happens where a function jumps, or changed nothing at
     all; `error` and `length` are those of the last one. `worked` says that some step did not fail,
     and `slow` counts the evaluations in a row that lowered the loss by little or nothing, while the
-    radius did not grow. The last step may be `settled`, see there. `foreseen` is the length of the
-    longest step whose end was as predicted.
+    radius did not grow. The last step may be `settled`, see there, and the model `right` about a
+    check. `foreseen` is the length of the longest step whose end was as predicted.
     """
 
     radius: Float[Array, ""]
@@ -86,6 +92,7 @@ class TrustRegion(eqx.Module):
     worked: Bool[Array, ""]
     slow: Int[Array, ""]
     settled: Bool[Array, ""]
+    right: Bool[Array, ""]
     foreseen: Float[Array, ""]
 
     @staticmethod
@@ -94,7 +101,7 @@ class TrustRegion(eqx.Module):
         none, zero = jnp.zeros((), jnp.int32), jnp.zeros_like(radius)
         jacobian = jnp.zeros((n, size), radius.dtype)
         no = jnp.asarray(False)
-        return TrustRegion(radius, jacobian, no, none, none, zero, zero, no, none, no, zero)
+        return TrustRegion(radius, jacobian, no, none, none, zero, zero, no, none, no, no, zero)
 
     def nothing(self, count: int) -> Proposal:
         """No steps, where so many other points are evaluated."""
@@ -110,6 +117,7 @@ class TrustRegion(eqx.Module):
             ahead=zeros(),
             jacobian=self.jacobian,
             poor=jnp.asarray(False),
+            check=jnp.asarray(False),
         )
 
     def failed(self) -> Bool[Array, ""]:
@@ -160,14 +168,17 @@ class TrustRegion(eqx.Module):
         steps, change, slope, reduction = (a[:-1] for a in (steps, change, slope, reduction))
         # where the model asks for nothing, a point that teaches it something
         eps = jnp.finfo(row.dtype).eps
-        improve = self.improve | ~(reduction[0] > eps * jnp.sum(row**2))
+        check = ~(reduction[0] > eps * jnp.sum(row**2))
+        improve = self.improve | check
         other = _roomy(self.radius * lacking, *sides)
         first = steps.at[0].set(jnp.where(improve, other, steps[0]))
+        change = change.at[0].set(dot(first[0], jacobian))
         low, high = (None if side is None else side[None] for side in sides)
         inside = lambda ends: jnp.clip(ends, low, high)
         points, others = beside(first, steps[0], self.radius, inside, count, turn)
         reduction = reduction.at[0].set(jnp.where(improve, 0, reduction[0]))
-        return Proposal(points, others, row[None] + change, reduction, slope, ahead, jacobian, poor)
+        predicted = row[None] + change
+        return Proposal(points, others, predicted, reduction, slope, ahead, jacobian, poor, check)
 
     def _fit(
         self, history: History, center: Array, row: Array, sigma: Array
@@ -211,7 +222,9 @@ class TrustRegion(eqx.Module):
         funs = jnp.where(good, jnp.sum(rows**2, axis=1) / 2, jnp.inf)
         lowest, funs = jnp.min(funs), jnp.where(proposal.others, jnp.inf, funs)
         best = jnp.argmin(funs)
-        fun, reduction = funs[best], proposal.reduction[best]
+        # what rounding may do says nothing against the model
+        fun, promise = funs[best], proposal.reduction[best]
+        reduction = jnp.where(promise > 2 * jnp.finfo(row.dtype).eps * before, promise, 0)
         length: Array = jnp.linalg.norm(proposal.points[best])
         tiny = jnp.finfo(row.dtype).tiny
         off = jnp.linalg.norm(rows[best] - proposal.predicted[best])
@@ -238,7 +251,8 @@ class TrustRegion(eqx.Module):
         radius = jnp.where(failed & ~wait, lower, self.radius)
         grow = held & (error < _PREDICTED)
         radius = jnp.where(grow, jnp.maximum(radius, 2 * length), radius)
-        radius = jnp.where(~tried & ~self.improve, 0.5 * radius, radius)
+        check = self._checked(proposal, row, rows[0], good[0])
+        radius = jnp.where(~tried & ~self.improve, check.factor * radius, radius)
         improve = failed & proposal.poor & ~self.improve
         revised = TrustRegion(
             radius=radius,
@@ -250,10 +264,34 @@ class TrustRegion(eqx.Module):
             length=jnp.where(failed, length, self.length),
             slow=jnp.where((lowest < (1 - _LITTLE) * before) | grow, 0, self.slow + len(rows)),
             worked=self.worked | (tried & ~failed),
-            settled=settled(self.settled, outcome, length, tested[best]),
+            settled=check.right | settled(self.settled, outcome, length, tested[best]),
+            right=check.right,
             foreseen=jnp.where(grow, jnp.maximum(self.foreseen, length), self.foreseen),
         )
         return revised
+
+    def _checked(
+        self, proposal: Proposal, row: Float[Array, " P"], there: Float[Array, " P"], good: Array
+    ) -> "_Check":
+        """What the residuals `there` say of the model, if they are those of a check.
+
+        A check that changes too little is followed by one farther away, one that the model got
+        wrong by a nearer one.
+        """
+        off, expected = (jnp.linalg.norm(proposal.predicted[0] - a) for a in (there, row))
+        before = jnp.sum(row**2) / 2
+        rise = jnp.sum(there**2) / 2 - before
+        tells = rise > TELLING * jnp.finfo(row.dtype).eps * before
+        right = proposal.check & good & tells & (off < _RIGHT * expected)
+        nothing = good & ~tells & jnp.any(there != row)
+        return _Check(right, jnp.where(right, 1, jnp.where(nothing, _FARTHER, 0.5)))
+
+
+class _Check(NamedTuple):
+    """Whether the model was right, and by what the radius changes."""
+
+    right: Bool[Array, ""]
+    factor: Float[Array, ""]
 
 
 def _roomy(step: Array, low: Array | None, high: Array | None) -> Array:

@@ -22,7 +22,7 @@ from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import differ
 from smoothdiff._solvers._parameter_scan import Scan
 from smoothdiff._solvers._quadratic_trust import Proposal
-from smoothdiff._solvers._ratio_test import are_level, is_lower
+from smoothdiff._solvers._ratio_test import are_level
 from smoothdiff._solvers._stages import FIRST, SCAN, TRUST, WIDE, Sizes, by_stage, where
 from smoothdiff._solvers._turns import Turn
 from smoothdiff._solvers._value_state import SIDES, ValueState
@@ -85,10 +85,7 @@ class ValueSearch(ValueState):
         """The search with these new evaluations."""
         before = self.history.best(self.start)[2]
         known = self.kept(new)
-        lower = is_lower(known.history.best(self.start)[2], before)
-        idle = jnp.where(lower, 0, self.idle + sizes.step)
-        turn = self.turn.more(sizes.step)
-        known = eqx.tree_at(lambda s: (s.turn, s.idle), known, (turn, idle))
+        known = eqx.tree_at(lambda s: s.turn, known, self.turn.more(sizes.step))
 
         def first() -> "ValueSearch":
             first = self.first.known(sizes.step)
@@ -129,7 +126,9 @@ class ValueSearch(ValueState):
         known = eqx.tree_at(lambda s: s.scan, self, scan)
         goes_on = scan.failed & (self.searches == 0)
         stage = jnp.where(goes_on, WIDE, self.stage).astype(self.stage.dtype)
-        known = eqx.tree_at(lambda s: s.stage, known, stage)
+        # what a scan is to find is no point that is lower
+        new = stage, jnp.where(goes_on, 0, self.stale)
+        known = eqx.tree_at(lambda s: (s.stage, s.stale), known, new)
         first = FirstPoints.start(scan.found, SIDES)
         first = dataclasses.replace(first, reach=scan.nearest / params.sigma)
         anew = known.anew(params, scan.found, first, jnp.ones_like(scan.fun))

@@ -26,6 +26,8 @@ _PATIENT = 4
 SIDES = 2
 # first points that fail come nearer until they are so near, in sigma
 _NEAREST = 1e-5
+# a search of a function without noise ends after so many times its patience without progress
+_PATIENCES = 2
 # the widths of later searches, in sigma, as powers of ten at random
 _NARROWEST, _WIDEST = -1.5, 0.3
 
@@ -39,14 +41,12 @@ class ValueState(AbstractPointSearch):
     the second; what that finds is searched like the first. A patient search never goes back to the
     lowest sample: what is lowest by chance does not lead it away from where the smoothed function
     is low. Nor does any search where the function is `noisy`: where it gave another value for the
-    same point, which the first round of samples begins with. `idle` counts the evaluations that
-    lowered its lowest value by no more than rounding. Parameters are `unchanging` whose first
-    points had the value of the start.
+    same point, which the first round of samples begins with. Parameters are `unchanging` whose
+    first points had the value of the start.
     """
 
     scan: Scan | None
     searches: Int[Array, ""]
-    idle: Int[Array, ""]
     noisy: Bool[Array, ""]
     unchanging: Bool[Array, " n"]
     trust: QuadraticTrust
@@ -81,13 +81,13 @@ class ValueState(AbstractPointSearch):
             evaluated=none,
             small=none,
             stale=none,
+            mark=jnp.full_like(never, jnp.inf),
             pilot=Pilot.start(theta),
             average=None,
             look=None,
             first=first,
             scan=None,
             searches=none,
-            idle=none,
             noisy=jnp.asarray(False),
             unchanging=jnp.zeros(n, bool),
             trust=QuadraticTrust.start(sigma, width),
@@ -204,8 +204,11 @@ class ValueState(AbstractPointSearch):
     def lost(self, sizes: Sizes) -> Bool[Array, ""]:
         """Whether neither model leads anywhere; after one converged the wide one may yet."""
         narrow = is_narrow(self.center.trust.width) & ~self.noisy
-        lost = self.center.lost(sizes) | (narrow & (self.idle >= sizes.patience))
+        lost = self.center.lost(sizes) | (narrow & (self.stale >= sizes.patience))
         lost &= self.trust.failed() | self.later()
+        # the smoothed function may fall for long where the function itself does not
+        searches = (self.is_local() | (self.stage == WIDE)) & (self.rounds > 0) & ~self.noisy
+        lost |= searches & (self.stale >= _PATIENCES * sizes.patience)
         return lost if self.scan is None else lost | (self.scan.failed & (self.stage == SCAN))
 
     def patient(self, searches: Int[Array, ""]) -> Bool[Array, ""]:

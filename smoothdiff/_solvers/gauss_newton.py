@@ -107,9 +107,10 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             the root of the rounding of max(|y|, sigma). With batches steps and tolerances are
             compared by their norms, without sigma.
         norm: the norm of steps, in units of the tolerance.
-        patience: how many evaluations in a row without a lower point end a search. By default
-            20 (n + 1), and in the last search at least 100. With batches it counts steps, by
-            default 30, and the last search goes on.
+        patience: a search ends after so many evaluations in a row that together lowered the loss
+            by less than a share of 1e-8 (float32: 8e-6). By default 20 (n + 1), at least five
+            steps, and in the last search at least 100. With batches it counts steps, by default 30,
+            and the last search goes on.
         restarts: how many searches may follow, with the first sigma and other random numbers: for
             residuals with several minima, or with plateaus. They begin anywhere within the bounds,
             or without bounds around the best point so far, at a random width. With batches they
@@ -185,9 +186,8 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         first = 4 + int(3 * math.log(n))
         # what the history has need not be seen again
         later = min(first, max(4, n))
-        patience = self.patience or max(
-            _point_by_point.PATIENCE * (n + 1), 0 if self.restarts else _LAST
-        )
+        usual = _point_by_point.patience(n, self.num_samples)
+        patience = self.patience or max(usual, 0 if self.restarts else _LAST)
         return Sizes.of(self.num_samples, first, later, patience)
 
     def evaluations_per_step(self, y: PyTree[Array]) -> int:
@@ -234,7 +234,7 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         return stopped(state.progress, over, converged)
 
     def reason(self, state: Any) -> str:
-        """Small steps, or too many evaluations without a lower point."""
+        """Small steps, or too many evaluations that hardly lowered the loss."""
         return "converged" if state.search.converged() else "stalled"
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):

@@ -102,9 +102,11 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
             compared by their norms, without sigma.
         norm: the norm of steps, in units of the tolerance.
         patience: a search ends after so many evaluations in a row in which the wide model led
-            nowhere, if the local one does not either; by default 20 (n + 1). Within a thousandth of
-            sigma, so many without a lower point are enough, and a model is done at once where
-            values differ by rounding alone. With batches it counts steps, by default 30.
+            nowhere, if the local one does not either. Without noise so many within a thousandth of
+            sigma, or twice as many, are enough that together lowered the function by less than a
+            share of 1e-8 (float32: 8e-6). A model is done at once where values differ by rounding
+            alone. By default 20 (n + 1), and at least five steps. With batches it counts steps, by
+            default 30.
         restarts: how many searches may follow: for functions with several minima. Within bounds a
             first search that is long on wide samples, or else the second, tries each parameter
             alone, from bound to bound. That ends after 33 evaluations unless the parameters act
@@ -165,7 +167,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
             return None
         # about one for each parameter; Sobol points are balanced if they are a power of two
         count = 2 ** int(math.log2(min(max(n, _FEW), _SOME)))
-        patience = self.patience or _point_by_point.PATIENCE * (n + 1)
+        patience = self.patience or _point_by_point.patience(n, self.num_samples)
         return Sizes.of(self.num_samples, count, count, patience)
 
     def evaluations_per_step(self, y: PyTree[Array]) -> int:
