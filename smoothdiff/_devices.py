@@ -17,7 +17,7 @@ from jaxtyping import PyTree
 
 def default_platform() -> str:
     """That of the device where JAX puts new arrays."""
-    device = jax.config.jax_default_device
+    device = _chosen()
     return jax.default_backend() if device is None else getattr(device, "platform", device)
 
 
@@ -32,7 +32,7 @@ def where_committed(tree: PyTree) -> Any:
     for leaf in jax.tree.leaves(tree):
         if isinstance(leaf, jax.Array) and leaf.committed:
             return next(iter(leaf.devices()))
-    return jax.config.jax_default_device
+    return _chosen()
 
 
 def on_cpu() -> contextlib.AbstractContextManager:
@@ -64,6 +64,11 @@ def _brought(leaf: Any) -> Any:
         data = _brought(jax.random.key_data(leaf))
         return jax.random.wrap_key_data(data, impl=jax.random.key_impl(leaf))
     return jnp.asarray(np.asarray(leaf))
+
+
+def _chosen() -> Any:
+    """The device that the user said new arrays are on, or its platform; None where nobody did."""
+    return jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _cpu() -> Any:

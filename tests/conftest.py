@@ -47,10 +47,10 @@ OPTIMISED = [
 ]
 
 
-# what is compiled is kept for later modules, until a process has so many bytes
+# what is compiled is kept for later modules, unless the process has so many bytes before one
 MEMORY = 3e9
 # how this process compiled for its last module
-FOR: dict[str, bool] = {}
+LAST: dict[str, bool] = {}
 
 
 def pytest_configure(config):
@@ -117,9 +117,9 @@ def compiles_quickly(request):
 def forget_compiled(request):
     """Drops what was compiled where it is too much, or of no use to a module."""
     quickly = compiles_quickly(request)
-    if quickly != FOR.get("quickly", quickly) or memory() > MEMORY:
+    if quickly != LAST.get("quickly", quickly) or memory() > MEMORY:
         jax.clear_caches()
-    FOR["quickly"] = quickly
+    LAST["quickly"] = quickly
     jax.config.update("jax_disable_most_optimizations", quickly)
 
 

@@ -131,6 +131,7 @@ def test_no_arguments():
 
 def test_calls_outside_of_jit_compile_once(caplog):
     box, counted = stairs_box()
+    jax.clear_caches()
     box(jnp.full(2, 0.5))
     with jax.log_compiles(), caplog.at_level(logging.WARNING):
         for i in range(3):

@@ -145,7 +145,7 @@ def test_the_radius_follows_the_acceptance_ratio():
 def test_a_check_says_whether_the_model_is_right_or_is_followed_by_another():
     """The model promises nothing, and predicts residuals of 2 where there were 1."""
     before = TrustRegion.start(jnp.asarray(1.0), 1, 1)
-    checked = lambda there: outcome(there, before, predicted=jnp.asarray(2.0), check=True)
+    checked = lambda there: outcome(there, before, predicted=2.0, check=True)
     right = checked(2.05)
     assert right.right
     assert right.settled

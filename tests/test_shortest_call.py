@@ -271,6 +271,7 @@ def test_the_host_takes_the_steps_of_optimistix(x64):
 @pytest.mark.parametrize("solver", [sd.GaussNewton, sd.NewtonCG])
 def test_another_function_or_sigma_compiles_nothing_but_the_function(solver, caplog):
     traced = []
+    jax.clear_caches()
 
     def run(fun, key, sigma):
         call: Any = sd.least_squares if solver is sd.GaussNewton else sd.minimise

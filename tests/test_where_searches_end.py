@@ -108,8 +108,8 @@ def searched(dtype):
 
 
 def lowered(search, value, count):
-    new = History(*(jnp.full(s, value, search.mark.dtype) for s in ((1, 3), (1, 1), (1,))), ONE)
-    return search.kept(new).marked(count)
+    points, rows, funs = (jnp.full(s, value, search.mark.dtype) for s in ((1, 3), (1, 1), (1,)))
+    return search.kept(History(points, rows, funs, ONE)).marked(count)
 
 
 ONE = jnp.ones(1, bool)
