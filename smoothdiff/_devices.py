@@ -17,14 +17,18 @@ from jaxtyping import PyTree
 
 def default_platform() -> str:
     """That of the device where JAX puts new arrays."""
-    device = _chosen()
+    return platform_of(_chosen())
+
+
+def platform_of(device: Any) -> str:
+    """That of a device, by itself or by its name; None stands for JAX's own choice."""
     return jax.default_backend() if device is None else getattr(device, "platform", device)
 
 
 def is_moved(device: Any) -> bool:
     """Whether steps are on a CPU though the function runs elsewhere, on this device."""
-    platform = default_platform() if device is None else getattr(device, "platform", device)
-    return platform != "cpu" and jax.process_count() == 1 and _cpu() is not None
+    other = platform_of(device) != "cpu"
+    return other and jax.process_count() == 1 and _cpu() is not None
 
 
 def where_committed(tree: PyTree) -> Any:

@@ -67,7 +67,7 @@ class HostProblem(Problem):
         """As for any problem, compiled for shapes; and with how well to compile the function."""
         program, out = traced(self.fun, y, self.args)
         check(out)
-        quick = is_short(program, self.host.sizes.step)
+        quick = is_short(program, self.host.sizes.step, self.device)
         with self.place():
             return dataclasses.replace(self, quick=quick), self.host.init(self.here(y), out)
 

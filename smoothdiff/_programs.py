@@ -1,11 +1,12 @@
 """Which programs are compiled quickly: those that run so short that compiling takes longer."""
 
 import math
+from typing import Any
 
 import jax
 from jax.extend.core import ClosedJaxpr, Jaxpr
 
-from smoothdiff._devices import default_platform
+from smoothdiff._devices import default_platform, platform_of
 
 # half of the time of compiling is saved, and a program takes two to three times as long
 QUICKLY = {"xla_backend_optimization_level": 0}
@@ -13,9 +14,13 @@ QUICKLY = {"xla_backend_optimization_level": 0}
 _SHORT = 100_000
 
 
-def is_short(program: ClosedJaxpr, times: int = 1) -> bool:
-    """Whether a program is short on the CPU, so many times at once; with a loop it never is."""
-    return default_platform() == "cpu" and times * _numbers(program.jaxpr) < _SHORT
+def is_short(program: ClosedJaxpr, times: int = 1, device: Any = None) -> bool:
+    """Whether a program is short on the CPU, so many times at once; with a loop it never is.
+
+    It runs on a device that is given, or where new arrays are.
+    """
+    platform = default_platform() if device is None else platform_of(device)
+    return platform == "cpu" and times * _numbers(program.jaxpr) < _SHORT
 
 
 def _numbers(jaxpr: Jaxpr) -> float:

@@ -230,8 +230,10 @@ class Run:
             # those that the user knows
             solver, state = solver.solver, state.state
         history = self.history[: self.steps]
+        with self.problem.place():
+            natural = self.units.natural(y)
         return Result(
-            self.units.natural(y),
+            natural,
             reason=reason,
             history=history,
             solver=solver,

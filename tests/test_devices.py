@@ -90,7 +90,7 @@ def test_steps_that_are_moved_are_the_same(monkeypatch, no_cpu):
         return np.array([(*r.y, r.fun) for r in result.history])
 
     before = run()
-    monkeypatch.setattr(_devices, "default_platform", lambda: "gpu")
+    monkeypatch.setattr(_devices, "platform_of", lambda device: "gpu")
     if no_cpu:  # as with JAX_PLATFORMS=cuda
         monkeypatch.setattr(_devices, "_cpu", lambda: None)
     assert _devices.is_moved(None) != no_cpu

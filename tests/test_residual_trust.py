@@ -149,13 +149,22 @@ def test_a_check_says_whether_the_model_is_right_or_is_followed_by_another():
     right = checked(2.05)
     assert right.right
     assert right.settled
-    assert float(right.radius) == 1
+    assert right.slow == 0
+    assert float(right.radius) == pytest.approx(0.8)
+    valley = outcome(2.05, before, predicted=2.0, ahead=0.1, check=True)
+    assert not valley.right
+    assert not valley.settled
     for wrong in (2.2, 1.5, jnp.nan):  # nearer
         assert not checked(wrong).right
         assert float(checked(wrong).radius) == 0.5
-    little = checked(1.00001)  # farther
-    assert not little.right
-    assert float(little.radius) == 4
+    near = eqx.tree_at(lambda t: t.radius, before, jnp.asarray(0.01))
+    for there in (1.00001, 0.99999):
+        little = outcome(there, near, predicted=1.00002, check=True)  # farther
+        assert not little.right
+        assert float(little.radius) == pytest.approx(0.04)
+        assert float(outcome(there, before, predicted=1.00002, check=True).radius) == 1
+    lower = checked(0.5)
+    assert (bool(lower.right), float(lower.radius)) == (False, 0.5)
     plateau = checked(1.0)  # as before
     assert not plateau.right
     assert float(plateau.radius) == 0.5

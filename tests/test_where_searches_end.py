@@ -147,9 +147,11 @@ def test_evaluations_that_are_told_end_no_search():
 
 TIMES = np.linspace(0, 3, 40)
 NOISE = 0.05 * np.random.default_rng(0).standard_normal(40)
+peak = lambda y, t: y[0] * jnp.exp(-3 * (t - y[1]) ** 2) + y[2] * t
 FITS = {
     "line": (1, 12, lambda y, t: y[0] * t - 0.7 * t),
     "polynomial": (5, 24, lambda y, t: jnp.polyval(y, t, unroll=5) - jnp.cos(t)),
+    "peak": (3, 60, lambda y, t: peak(y, t) - peak((1.0, 1.2, 0.5), t)),
     "decay": (2, 50, lambda y, t: y[0] * jnp.exp(-y[1] * t) - 2 * jnp.exp(-0.7 * t)),
 }
 
@@ -168,6 +170,12 @@ def test_a_fit_of_noisy_data_ends_soon_after_its_minimum(fit, dtype, x64):
         assert result.evaluations < most
         best = minimize(lambda y: np.sum((curve(y, TIMES) + NOISE) ** 2) / 2, np.asarray(y0, float))
         assert result.fun < best.fun * (1 + 1e-5)
+        # the checks are what the errors of parameters are taken from
+        slopes = jax.jacobian(curve)(jnp.asarray(result.y, dtype), times)
+        exact = jnp.linalg.inv(slopes.T @ slopes) * (2 * result.fun / (len(NOISE) - n))
+        assert result.covariance is not None
+        found, right = (jnp.sqrt(jnp.diagonal(c)) for c in (result.covariance, exact))
+        np.testing.assert_allclose(found, right, rtol=0.1)
 
 
 @pytest.mark.slow

@@ -28,7 +28,7 @@ from smoothdiff._solvers._judgement import Values, judged, judging
 from smoothdiff._solvers._look import Look
 from smoothdiff._solvers._point_search import AbstractPointSearch
 from smoothdiff._solvers._random_numbers import in_step, takes_key
-from smoothdiff._solvers._ratio_test import taken_by_rounding
+from smoothdiff._solvers._ratio_test import is_lower, taken_by_rounding
 from smoothdiff._solvers._stages import Sizes, where
 
 # by default a search ends after so many evaluations for each parameter, and one, that did not lower
@@ -167,7 +167,7 @@ class PointStep(eqx.Module):
             ignored = after.ignored()
             small = solver.norm(params.layout.tree(jnp.where(ignored & ~lower, 0, moved))) < 1
             # a point that only teaches the model is as long as the radius
-            small |= after.right() & ~lower
+            small |= after.right() & ~is_lower(fun, progress.lowest_fun)
             small &= (solver.rtol > 0) | (solver.atol > 0)
             apart = jnp.where(ignored, jnp.inf, _PLATEAU * rounding)
             small &= after.settled() & ~after.plateau(apart)

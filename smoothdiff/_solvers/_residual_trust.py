@@ -29,7 +29,9 @@ _RIDGE = 1e-8
 _PREDICTED = 0.5
 # a model is right about a check whose change it predicted with an error below this share
 _RIGHT = 0.1
-# a check that changes hardly anything is followed by one so many times as far away
+# ... after which the next one is so much nearer, as the same would say nothing
+_NEXT = 0.8
+# a check that changes hardly anything is followed by one so many times as far away, within sigma
 _FARTHER = 4.0
 # a direction with less than this share of the radius is not covered by evaluations
 _COVERED = 0.2
@@ -170,7 +172,8 @@ class TrustRegion(eqx.Module):
         eps = jnp.finfo(row.dtype).eps
         check = ~(reduction[0] > eps * jnp.sum(row**2))
         improve = self.improve | check
-        other = _roomy(self.radius * lacking, *sides)
+        # to both sides in turns
+        other = _roomy(self.radius * jnp.where(turn % 2 == 0, 1, -1) * lacking, *sides)
         first = steps.at[0].set(jnp.where(improve, other, steps[0]))
         change = change.at[0].set(dot(first[0], jacobian))
         low, high = (None if side is None else side[None] for side in sides)
@@ -252,7 +255,8 @@ class TrustRegion(eqx.Module):
         grow = held & (error < _PREDICTED)
         radius = jnp.where(grow, jnp.maximum(radius, 2 * length), radius)
         check = self._checked(proposal, row, rows[0], good[0])
-        radius = jnp.where(~tried & ~self.improve, check.factor * radius, radius)
+        after = jnp.minimum(check.factor * radius, jnp.maximum(radius, 1))
+        radius = jnp.where(~tried & ~self.improve, after, radius)
         improve = failed & proposal.poor & ~self.improve
         revised = TrustRegion(
             radius=radius,
@@ -262,7 +266,9 @@ class TrustRegion(eqx.Module):
             rough=rough.astype(fails.dtype),
             error=jnp.where(failed, error, self.error),
             length=jnp.where(failed, length, self.length),
-            slow=jnp.where((lowest < (1 - _LITTLE) * before) | grow, 0, self.slow + len(rows)),
+            slow=jnp.where(
+                (lowest < (1 - _LITTLE) * before) | grow | check.right, 0, self.slow + len(rows)
+            ),
             worked=self.worked | (tried & ~failed),
             settled=check.right | settled(self.settled, outcome, length, tested[best]),
             right=check.right,
@@ -275,16 +281,19 @@ class TrustRegion(eqx.Module):
     ) -> "_Check":
         """What the residuals `there` say of the model, if they are those of a check.
 
-        A check that changes too little is followed by one farther away, one that the model got
-        wrong by a nearer one.
+        A check that changes hardly anything, as predicted, is followed by one farther away, one
+        that the model got wrong by a nearer one. Where the model promises much beyond the radius it
+        has not converged.
         """
-        off, expected = (jnp.linalg.norm(proposal.predicted[0] - a) for a in (there, row))
-        before = jnp.sum(row**2) / 2
-        rise = jnp.sum(there**2) / 2 - before
-        tells = rise > TELLING * jnp.finfo(row.dtype).eps * before
-        right = proposal.check & good & tells & (off < _RIGHT * expected)
-        nothing = good & ~tells & jnp.any(there != row)
-        return _Check(right, jnp.where(right, 1, jnp.where(nothing, _FARTHER, 0.5)))
+        predicted, before = proposal.predicted[0], jnp.sum(row**2) / 2
+        off, expected = (jnp.linalg.norm(predicted - a) for a in (there, row))
+        little = TELLING * jnp.finfo(row.dtype).eps * before
+        rise, foreseen = (jnp.sum(a**2) / 2 - before for a in (there, predicted))
+        known = proposal.check & good & (off < _RIGHT * expected)
+        right = known & (rise > little) & ~(proposal.ahead > taken_by_rounding(before))
+        nothing = (jnp.abs(rise) <= little) & (foreseen <= little) & jnp.any(there != row)
+        farther = proposal.check & good & nothing | known & ~right
+        return _Check(right, jnp.where(right, _NEXT, jnp.where(farther, _FARTHER, 0.5)))
 
 
 class _Check(NamedTuple):

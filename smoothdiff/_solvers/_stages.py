@@ -15,7 +15,7 @@ FIRST, TRUST, WIDE, PILOT, LOOK, SCAN = 0, 1, 2, 3, 4, 5
 class Sizes(NamedTuple):
     """Evaluations a step, and samples of a first wide round and of a later one.
 
-    After `patience` evaluations in a row that hardly lowered the function a search ends.
+    After `patience` evaluations in a row that hardly lowered the function a search may end.
     """
 
     step: int

@@ -49,7 +49,8 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
       are taken again.
     - **The local model** needs one evaluation a step. $y_t$ is the best point. J fits the nearest
       points, and of all that do it differs least from the last J. The radius $\Delta$ grows if the
-      reduction is as predicted, and shrinks if the loss does not fall.
+      reduction is as predicted, and shrinks if the loss does not fall. Where J asks for no step, as
+      at the minimum of a fit to noisy data, points beside check it.
     - **The wide regression** takes over on functions that jump: when steps fail in a row, when a
       shorter step is predicted no better than a longer one, or when no residual changes. It samples
       rounds of points around a center, which may go uphill, reflected at the bounds:
@@ -100,9 +101,10 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             tried may be anything.
         rtol: relative tolerance. The run has converged when three steps in a row are shorter than
             the tolerance, for each parameter atol + rtol max(|y|, sigma), unless only the radius
-            made them short, or they failed where the model promised more than rounding may take.
-            Where no step as long as a hundredth of sigma was predicted, and more than a tenth of
-            the first loss is left, that may be a ripple's minimum: wide rounds look around first.
+            made them short, or they failed where the model promised more than rounding may take. A
+            check whose residuals came as predicted counts as such a step. Where no step as long as
+            a hundredth of sigma was predicted, and more than a tenth of the first loss is left,
+            that may be a ripple's minimum: wide rounds look around first.
         atol: absolute tolerance. With both zero no run converges; else the tolerance is at least
             the root of the rounding of max(|y|, sigma). With batches steps and tolerances are
             compared by their norms, without sigma.
