@@ -188,7 +188,10 @@ def test_chunks_give_the_same(sampler, num_samples, baseline, key, x64):
 
 @pytest.mark.parametrize(
     ("sampler", "baselines"),
-    [(sd.Gaussian(), ("mean", "linear", "gp")), (sd.Sobol(), ("mean", "quadratic", "gp"))],
+    [
+        pytest.param(sd.Gaussian(), ("mean", "linear", "gp"), marks=pytest.mark.slow),
+        (sd.Sobol(), ("mean", "quadratic", "gp")),
+    ],
     ids=["gaussian", "sobol"],
 )
 def test_an_offset_costs_what_its_rounding_costs(sampler, baselines, x64):

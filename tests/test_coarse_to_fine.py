@@ -80,6 +80,7 @@ def test_all_evaluations_are_counted_and_paid_for():
     assert found.cost == pytest.approx(calls[0] / 64 + calls[1] / 16 + calls[2])
 
 
+@pytest.mark.slow
 def test_one_level_is_the_minimiser_itself():
     level, start = bowls()[-1].level, jnp.array([3.0, 3.0])
     found = sd.coarse_to_fine(sd.least_squares, [level], start, key=KEY)

@@ -93,6 +93,7 @@ def test_intervals_are_students(x64):
         result.parameter_intervals(95.0)
 
 
+@pytest.mark.slow
 def test_a_space_gives_errors_in_natural_values(x64):
     """The same as without it; on a logarithmic scale intervals are factors."""
     data = noisy(decay, TRUTH, 0.05)

@@ -71,7 +71,7 @@ def test_a_loss_that_is_high_on_the_other_side_is_tried_nearer_there_as_often():
     assert not first.around(jnp.ones(())).turned[0]
 
 
-@pytest.mark.parametrize("bounds", [None, (-2.0, 4.0)])
+@pytest.mark.parametrize("bounds", quick_of([None, (-2.0, 4.0)], [(-2.0, 4.0)]))
 def test_a_start_at_the_edge_of_where_it_fails_is_left(bounds):
     """Half of the first points fail, however near they are."""
 
@@ -163,6 +163,7 @@ def model(y, _):
     return y[0] * jnp.exp(jnp.clip(y[1] * t, -60, 60)) - 80 * jnp.exp(-0.03 * t)
 
 
+@pytest.mark.slow
 def test_one_sigma_for_parameters_of_different_scales(x64):
     y0 = jnp.array([60.0, -0.001])
     loss = lambda y: float(jnp.sum(model(y, None) ** 2))

@@ -205,6 +205,7 @@ def test_a_curve_without_noise_is_fitted_to_rounding(dtype):
     np.testing.assert_allclose(result.y, [2, 3], atol=2e3 * float(jnp.finfo(dtype).eps))
 
 
+@pytest.mark.slow
 def test_a_curve_with_noise_goes_to_the_least_squares_solution(x64):
     noise = 0.1 * np.random.default_rng(2).normal(size=20)
     curve = lambda y: y[0] * np.exp(-y[1] * TIMES) - 2 * np.exp(-3 * TIMES) - noise

@@ -135,6 +135,7 @@ def test_where_a_bound_is_open_nobody_looks(call, solver, fun):
     assert np.min(points[0]) < 0.5 < np.min(points[1])
 
 
+@pytest.mark.slow
 def test_a_zero_of_all_residuals_ends_a_look():
     points = []
     dip = lambda y: jnp.where(jnp.all(y > 0.85), jnp.append((y - DIP) / 5, 1.1), jnp.zeros(3))

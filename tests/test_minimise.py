@@ -13,6 +13,7 @@ import pytest
 
 import smoothdiff as sd
 from smoothdiff._black_box import UnknownOutputError
+from tests.parts import quick_of
 
 N = 8
 ADAM = sd.FirstOrder(optax.adam(0.05), 0.2, num_samples=N)
@@ -318,7 +319,7 @@ def root(y):
 
 
 @pytest.mark.parametrize("where", [{}, {"bounds": (-1.0, 2.0)}, {"space": sd.Range(-1.0, 2.0)}])
-@pytest.mark.parametrize("fails", [radius, root])
+@pytest.mark.parametrize("fails", quick_of([radius, root], [root]))
 def test_a_point_where_a_black_box_fails_leads_to_bounds_if_there_are_none(fails, where):
     box = sd.black_box(fails, jnp.float32(0))
     with pytest.raises(sd.MinimiseError, match=r"\[-\d") as caught:
@@ -544,7 +545,9 @@ class Hidden:
         return self.values(y)
 
 
-@pytest.mark.parametrize("solver", [ADAM, sd.NewtonCG(0.2)], ids=["adam", "newton"])
+@pytest.mark.parametrize(
+    "solver", [ADAM, pytest.param(sd.NewtonCG(0.2), marks=pytest.mark.slow)], ids=["adam", "newton"]
+)
 def test_a_function_with_other_values_is_refused_whatever_the_digest_says(solver, path):
     run = functools.partial(sd.minimise, y0=Y0, key=KEY, solver=solver, max_steps=3)
     square = lambda y: jnp.sum((y - 1) ** 2)

@@ -153,6 +153,7 @@ few_seeds = pytest.mark.parametrize("seeds", FEW_SEEDS, ids=["few seeds", "more 
 # what it finds
 
 
+@pytest.mark.slow
 @few_seeds
 def test_a_quadratic_takes_12_evaluations(seeds, dtype):
     target = (0.5, 0.3)
@@ -197,6 +198,7 @@ def test_plateaus_are_crossed_to_the_lowest(seeds, dtype):
     assert np.max(away) < 0.125
 
 
+@pytest.mark.slow
 @few_seeds
 def test_samples_widen_to_the_middle_of_a_plateau(seeds, dtype):
     """One of radius 1, twenty times as wide as sigma; its edge alone says where the middle is."""
@@ -265,6 +267,7 @@ def test_noise_of_1_and_10_percent_of_the_range(problem, noise):
     assert np.max(away) < 1.3 * np.sqrt(noise)
 
 
+@pytest.mark.slow
 @few_seeds
 def test_an_ellipse_of_condition_1e6_in_any_direction(seeds, x64):
     for seed in seeds:

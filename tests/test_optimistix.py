@@ -65,6 +65,7 @@ class Damped(Minimiser):
         return y, aux, stats | {"count": state["count"]}
 
 
+@pytest.mark.slow
 def test_the_best_so_far_is_that_of_our_steps():
     solver = optx.BestSoFarMinimiser(ADAM)
     bare = sd.minimise(bowl, START, TARGET, key=KEY, solver=ADAM, max_steps=40)

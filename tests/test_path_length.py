@@ -159,6 +159,7 @@ def test_a_step_that_fails_is_followed_by_a_narrower_one():
     np.testing.assert_allclose(solution.value, 5, atol=0.1)
 
 
+@pytest.mark.slow
 def test_a_schedule_is_multiplied_as_well():
     fun = lambda y, args: jnp.sum(y)
     run = lambda sigma: sd.minimise(
@@ -193,6 +194,7 @@ def test_leaves_without_a_sigma_take_the_steps_of_the_transformation():
     )
 
 
+@pytest.mark.slow
 def test_many_starts_at_once():
     fun = lambda y, args: jnp.sum(jnp.abs(y))
     one = lambda y: solve(fun, y, adam(0.5), 20).value

@@ -154,6 +154,7 @@ def test_it_crosses_vmap_and_scan():
     assert_same(flat(jax.jit(power)(first)), dense @ flat(V), scale=10)  # closed over
 
 
+@pytest.mark.slow
 def test_a_model_that_draws_its_points_again_crosses_scan():
     """With a batch_size the model keeps its key in place of the points."""
     make = sd.smooth_quadratic(fun, SIGMA, **PLAIN, num_samples=32, batch_size=10)

@@ -56,7 +56,7 @@ SUPPORT = sd.local_support(1, ndim=1)
     ("sampler", "num_samples", "baseline"),
     [
         pytest.param(sd.Gaussian(), 16, "mean", marks=pytest.mark.slow),
-        (sd.Gaussian(), 16, "none"),
+        pytest.param(sd.Gaussian(), 16, "none", marks=pytest.mark.slow),
         pytest.param(sd.Gaussian(antithetic=True), 17, "center", marks=pytest.mark.slow),
         pytest.param(sd.Sobol(replicates=2), 16, "mean", marks=pytest.mark.slow),
         (sd.Orthogonal(), 24, "mean"),

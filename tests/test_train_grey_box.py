@@ -124,6 +124,7 @@ def test_a_sigma_for_each_parameter_and_a_target():
     assert result.history[-2].fun > 0.5
 
 
+@pytest.mark.slow
 def test_a_training_that_was_killed_is_taken_up(tmp_path):
     path = tmp_path / "grey.npz"
     whole = train()

@@ -80,7 +80,7 @@ PRECISION = {
 }
 # 24 are enough for a full quadratic fit of pairs; two are one group of pairs, of frames
 QUICK = [(name, 24) for name in [*list(SAMPLERS)[::3], *NEW]]
-QUICK += [(name, 2) for name in ("gaussian", "replicates", "aggregate 2, quasi")]
+QUICK += [("aggregate 2, quasi", 2)]
 SAMPLERS |= NEW
 # one set that is even as a whole is fitted as a whole, which is biased
 WHOLE = [name for name, sampler in SAMPLERS.items() if sampler.group(64, 2) == 64]

@@ -131,6 +131,7 @@ def test_what_falls_little_by_little_is_no_sign_of_an_end_unless_all_is_rounding
     assert int(search.stale) == stale[-1] + 5
 
 
+@pytest.mark.slow
 def test_evaluations_that_are_told_end_no_search():
     fun = lambda y: float(np.sum((np.asarray(y) - 1) ** 2))
     told = 3 * jax.random.normal(jax.random.key(1), (200, 2))
