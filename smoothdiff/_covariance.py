@@ -73,8 +73,10 @@ def slopes(
         part = rows[:, start : start + _CHUNK].astype(float)
         part = part - part[here]
         gram += part @ part.T
-    # no value is known better than to its last digit
-    rounding = np.finfo(rows.dtype).eps ** 2 * np.mean(rows[here].astype(float) ** 2)
+    # no value is known better than to the last digit of what it is a difference of, which is as
+    # large as residuals are farther away
+    usual = np.median(np.mean(np.square(rows, dtype=float), axis=1))
+    rounding = np.finfo(rows.dtype).eps ** 2 * max(usual, np.mean(rows[here].astype(float) ** 2))
     least = max(rounding, np.finfo(float).tiny)
     best, found, even = -np.inf, None, (np.inf, False)
     # curvature grows with the distance, by sigma or by what the residuals say

@@ -241,7 +241,7 @@ class ResidualSearch(AbstractPointSearch):
     def _after_local(
         self, row: Array, rows: Array, good: Array, proposal: Proposal
     ) -> "ResidualSearch":
-        trust = self.trust.revise(proposal, row, rows, good)
+        trust = self.trust.revise(proposal, row, rows, good, compared=self.average is None)
         local = eqx.tree_at(lambda s: s.trust, self, trust)
         wide = self.wide
         vain = (wide.rounds > 0) & (wide.true < _TRUE)

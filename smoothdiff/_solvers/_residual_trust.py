@@ -218,9 +218,18 @@ class TrustRegion(eqx.Module):
         return jacobian, directions[:, 0], least < _COVERED * self.radius / width
 
     def revise(
-        self, proposal: Proposal, row: Float[Array, " P"], rows: Float[Array, "K P"], good: Array
+        self,
+        proposal: Proposal,
+        row: Float[Array, " P"],
+        rows: Float[Array, "K P"],
+        good: Array,
+        compared: bool = True,
     ) -> "TrustRegion":
-        """The region after the residuals `rows` came."""
+        """The region after the residuals `rows` came.
+
+        Where they are not to be `compared`, since there is more noise than the model sees, a check
+        is no evidence.
+        """
         before = jnp.sum(row**2) / 2
         funs = jnp.where(good, jnp.sum(rows**2, axis=1) / 2, jnp.inf)
         lowest, funs = jnp.min(funs), jnp.where(proposal.others, jnp.inf, funs)
@@ -254,7 +263,7 @@ class TrustRegion(eqx.Module):
         radius = jnp.where(failed & ~wait, lower, self.radius)
         grow = held & (error < _PREDICTED)
         radius = jnp.where(grow, jnp.maximum(radius, 2 * length), radius)
-        check = self._checked(proposal, row, rows[0], good[0])
+        check = self._checked(proposal, row, rows[0], good[0] & compared)
         after = jnp.minimum(check.factor * radius, jnp.maximum(radius, 1))
         radius = jnp.where(~tried & ~self.improve, after, radius)
         improve = failed & proposal.poor & ~self.improve
