@@ -100,6 +100,7 @@ def test_what_is_linear_is_exact_for_value_gradient_and_hessian(key, x64):
     np.testing.assert_allclose(by_ad[1], 0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_evaluations_are_counted_and_errors_cover(key):
     seen = []
 

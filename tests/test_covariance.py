@@ -107,6 +107,7 @@ def test_a_space_gives_errors_in_natural_values(x64):
         np.testing.assert_allclose(high[name] / y, factor)
 
 
+@pytest.mark.slow
 def test_an_angle_has_its_error_at_the_end_of_its_period(x64):
     data = noisy(wave, {"a": 2.0, "b": 3.15}, 0.1)
     space = {"a": None, "b": sd.Periodic(low=-np.pi)}

@@ -171,6 +171,7 @@ def test_a_call_whose_large_arguments_went_with_a_worker_is_made_again(threads):
     assert float(f(2.0, scene)) == 2.0**18 + 2
 
 
+@pytest.mark.slow
 def test_workers_that_nothing_can_end_are_an_error_once_all_of_them_hang(threads):
     f = box(threads, host_functions.a_while, on_error="nan", timeout=0.5)
     assert np.isnan(f(3.0))

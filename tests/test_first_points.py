@@ -173,6 +173,7 @@ def test_one_sigma_for_parameters_of_different_scales(x64):
     assert loss(result.y) < 1e-4 * loss(y0)
 
 
+@pytest.mark.slow
 def test_a_round_beyond_the_domain_is_drawn_nearer(x64):
     """A function that has numbers in a small ball only, and jumps there, is still minimised."""
 

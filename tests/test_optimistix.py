@@ -167,6 +167,7 @@ def test_a_curved_valley_ends_by_itself():
     assert np.mean(solutions.result == optx.RESULTS.successful) >= 0.5
 
 
+@pytest.mark.slow
 def test_what_leads_nowhere_is_no_success():
     """A plateau that is wider than anything that was looked at."""
     flat = lambda y, args: 0 * jnp.sum(y) + 1

@@ -227,6 +227,7 @@ def test_samples_of_a_step_that_does_not_fit_cost_no_trial():
     assert result.evaluations == len(HOST.points) == 32 + 1
 
 
+@pytest.mark.slow
 def test_an_interruption_after_the_trial_changes_nothing(tmp_path):
     run = Run(SETTINGS["newton"]())
     budget = 20 + run.solver.final_evaluations(LIKE)

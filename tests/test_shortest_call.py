@@ -64,6 +64,7 @@ def test_a_run_ends_where_only_rounding_is_left(above):
     assert result.evaluations < 25
 
 
+@pytest.mark.slow
 def test_many_parameters_get_first_order_and_a_support_its_own_solver():
     y0 = jnp.zeros(100)
     result = sd.minimise(lambda y, _: jnp.sum((y - 1) ** 2), y0, key=KEY, max_steps=30)

@@ -150,6 +150,7 @@ def test_a_training_that_was_killed_is_taken_up(tmp_path):
         train(checkpoint=path, kept=0)
 
 
+@pytest.mark.slow
 def test_a_callback_and_ctrl_c_end_it_with_what_there_is():
     result = train(callback=lambda record: record.round == 2)
     assert (result.reason, len(result.history)) == ("callback", 2)
