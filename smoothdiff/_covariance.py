@@ -73,8 +73,8 @@ def slopes(
         part = rows[:, start : start + _CHUNK].astype(float)
         part = part - part[here]
         gram += part @ part.T
-    # no value is known better than to the last digit of what it is a difference of, which is as
-    # large as residuals are farther away
+    # A residual is a difference of numbers that may be much larger, and no better than their last
+    # digit. How large they are, most evaluations show
     usual = np.median(np.mean(np.square(rows, dtype=float), axis=1))
     rounding = np.finfo(rows.dtype).eps ** 2 * max(usual, np.mean(rows[here].astype(float) ** 2))
     least = max(rounding, np.finfo(float).tiny)

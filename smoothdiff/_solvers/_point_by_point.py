@@ -31,8 +31,8 @@ from smoothdiff._solvers._random_numbers import in_step, takes_key
 from smoothdiff._solvers._ratio_test import is_lower, taken_by_rounding
 from smoothdiff._solvers._stages import Sizes, where
 
-# by default a search ends after so many evaluations for each parameter, and one, that did not lower
-# the function, and after no fewer steps than that
+# by default a search ends after so many evaluations for each parameter, and one, that hardly
+# lowered the function, but after no fewer steps than that
 _PATIENCE, _STEPS = 20, 5
 # values that are the same at points further apart than so many roots of the rounding: a plateau
 _PLATEAU = 3

@@ -227,8 +227,7 @@ class TrustRegion(eqx.Module):
     ) -> "TrustRegion":
         """The region after the residuals `rows` came.
 
-        Where they are not to be `compared`, since there is more noise than the model sees, a check
-        is no evidence.
+        They are `compared` with the model, for a check, unless others were drawn with another key.
         """
         before = jnp.sum(row**2) / 2
         funs = jnp.where(good, jnp.sum(rows**2, axis=1) / 2, jnp.inf)
@@ -301,7 +300,7 @@ class TrustRegion(eqx.Module):
         known = proposal.check & good & (off < _RIGHT * expected)
         right = known & (rise > little) & ~(proposal.ahead > taken_by_rounding(before))
         nothing = (jnp.abs(rise) <= little) & (foreseen <= little) & jnp.any(there != row)
-        farther = proposal.check & good & nothing | known & ~right
+        farther = (proposal.check & good & nothing) | (known & ~right)
         return _Check(right, jnp.where(right, _NEXT, jnp.where(farther, _FARTHER, 0.5)))
 
 

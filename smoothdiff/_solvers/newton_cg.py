@@ -102,11 +102,11 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
             compared by their norms, without sigma.
         norm: the norm of steps, in units of the tolerance.
         patience: a search ends after so many evaluations in a row in which the wide model led
-            nowhere, if the local one does not either. Without noise so many within a thousandth of
-            sigma, or twice as many, are enough that together lowered the function by less than a
-            share of 1e-8 (float32: 8e-6). A model is done at once where values differ by rounding
-            alone. By default 20 (n + 1), and at least five steps. With batches it counts steps, by
-            default 30.
+            nowhere, if the local one does not either. It also ends where twice as many lowered the
+            function, in all, by less than a share of 1e-8 (float32: 8e-6); within a thousandth of
+            sigma as many are enough. Not where the function has noise. A model is done at once
+            where values differ by rounding alone. By default 20 (n + 1), and at least five steps.
+            With batches it counts steps, by default 30.
         restarts: how many searches may follow: for functions with several minima. Within bounds a
             first search that is long on wide samples, or else the second, tries each parameter
             alone, from bound to bound. That ends after 33 evaluations unless the parameters act
