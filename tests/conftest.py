@@ -1,5 +1,6 @@
 """What every test runs under: strict dtypes and ranks, warnings as errors, x64 off by default."""
 
+import collections
 import gc
 import math
 import multiprocessing
@@ -47,10 +48,16 @@ OPTIMISED = [
 ]
 
 
-# what is compiled is kept for later modules, unless the process has so many bytes before one
-MEMORY = 3e9
-# how this process compiled for its last module
-LAST: dict[str, bool] = {}
+# what is compiled is kept for later modules, unless the process has so many bytes before one, or
+# so many more than the last time that it was dropped: what was freed stays with the process
+MEMORY, MORE = 3e9, 2e8
+
+
+class Process:
+    """How this process compiled for its last module, and how many bytes it may have."""
+
+    quickly: bool | None = None
+    limit = MEMORY
 
 
 def pytest_configure(config):
@@ -87,6 +94,17 @@ def quickly_compiled():
 
 
 @pytest.fixture(scope="session")
+def devices(quickly_compiled):
+    """The same, of a process that has so many devices."""
+
+    def of(count):
+        flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={count}"
+        return {**os.environ, **quickly_compiled, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
+
+    return of
+
+
+@pytest.fixture(scope="session")
 def context():
     """Processes that have imported everything, and have not started JAX."""
     context = multiprocessing.get_context("forkserver")
@@ -107,19 +125,27 @@ def knows(flags):
     return tried.returncode == 0
 
 
-def compiles_quickly(request):
+def compiles_quickly(config, module):
     """Whether the tests of a module do."""
-    name = request.module.__name__.rpartition("test_")[2]
-    return request.config.option.markexpr != "slow" or name not in OPTIMISED
+    return config.option.markexpr != "slow" or module.rpartition("test_")[2] not in OPTIMISED
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(config, items):
+    """Modules that compile alike follow each other, those of many tests first."""
+    tests = collections.Counter(item.path for item in items)
+    first = lambda item: (compiles_quickly(config, item.path.stem), -tests[item.path], item.path)
+    items.sort(key=first)
 
 
 @pytest.fixture(autouse=True, scope="module")
 def forget_compiled(request):
     """Drops what was compiled where it is too much, or of no use to a module."""
-    quickly = compiles_quickly(request)
-    if quickly != LAST.get("quickly", quickly) or memory() > MEMORY:
+    quickly = compiles_quickly(request.config, request.module.__name__)
+    if Process.quickly not in (quickly, None) or memory() > Process.limit:
         jax.clear_caches()
-    LAST["quickly"] = quickly
+        Process.limit = max(Process.limit, memory() + MORE)
+    Process.quickly = quickly
     jax.config.update("jax_disable_most_optimizations", quickly)
 
 
@@ -144,7 +170,7 @@ def dtype(request):
 
     It compiles quickly, as float32 does in the quick part: it is the same test.
     """
-    double, quickly = request.param == "float64", compiles_quickly(request)
+    double, quickly = request.param == "float64", Process.quickly
     jax.config.update("jax_disable_most_optimizations", quickly or double)
     with jax.enable_x64(double):
         yield jax.numpy.dtype(request.param)

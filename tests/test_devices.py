@@ -1,6 +1,5 @@
 """The function runs where JAX does, the steps of a search on a CPU; a second CPU plays the GPU."""
 
-import os
 import subprocess
 import sys
 
@@ -73,10 +72,8 @@ assert places == {cpu} and result.fun < 1e-6  # who chose it has it
 
 
 @pytest.mark.slow
-def test_steps_are_on_the_cpu_and_the_function_is_where_jax_is(quickly_compiled):
-    flags = "--xla_force_host_platform_device_count=2"
-    environment = {**os.environ, **quickly_compiled, "XLA_FLAGS": flags}
-    ran = subprocess.run([sys.executable, "-c", SCRIPT], env=environment, capture_output=True)
+def test_steps_are_on_the_cpu_and_the_function_is_where_jax_is(devices):
+    ran = subprocess.run([sys.executable, "-c", SCRIPT], env=devices(2), capture_output=True)
     assert ran.returncode == 0, ran.stderr.decode()
 
 

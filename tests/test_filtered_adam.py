@@ -1,6 +1,5 @@
 """Transformations: Adam without filters, Algorithm 2 by hand, bounded steps, optax's wrappers."""
 
-import os
 import subprocess
 import sys
 from typing import Any
@@ -273,11 +272,9 @@ np.testing.assert_allclose(*found, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.slow
-def test_sharded_arrays():
-    flags = "--xla_force_host_platform_device_count=2"
-    environment = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
+def test_sharded_arrays(devices):
     done = subprocess.run(
-        [sys.executable, "-c", SHARDED], env=environment, capture_output=True, text=True
+        [sys.executable, "-c", SHARDED], env=devices(2), capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
 

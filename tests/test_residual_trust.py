@@ -114,7 +114,7 @@ def test_directions_that_no_point_has_keep_the_old_jacobian(x64):
     assert proposal.poor
 
 
-def outcome(fun, trust=None, predicted=0.5, ahead=0.0, check=False):
+def outcome(fun, trust=None, predicted=0.5, ahead=0.0, check=False, lost=False):
     """The region after a step of length one from 1, where half of that was predicted."""
     one = jnp.ones((1, 1))
     proposal = Proposal(
@@ -127,6 +127,7 @@ def outcome(fun, trust=None, predicted=0.5, ahead=0.0, check=False):
         jacobian=one,
         poor=jnp.asarray(False),
         check=jnp.asarray(check),
+        lost=jnp.asarray(lost),
     )
     trust = trust or TrustRegion.start(jnp.asarray(1.0), 1, 1)
     row = jnp.full((1, 1), fun)
@@ -140,6 +141,14 @@ def test_the_radius_follows_the_acceptance_ratio():
     assert outcome(50.0).radius == pytest.approx(0.1)
     for anything in (jnp.nan, jnp.inf):
         assert outcome(anything).radius == pytest.approx(0.1)
+
+
+def test_a_step_that_may_be_lost_in_rounding_is_no_failure(x64):
+    for fun in (1.0, 1.5):
+        assert outcome(fun).fails == 1
+        lost = outcome(fun, lost=True)
+        assert (lost.fails, lost.rough) == (0, 0)
+        assert lost.settled
 
 
 def test_a_check_says_whether_the_model_is_right_or_is_followed_by_another():

@@ -1,6 +1,5 @@
 """The samples of one estimate over several devices, here several of one host in a fresh process."""
 
-import os
 import subprocess
 import sys
 
@@ -68,13 +67,12 @@ assert {shard.data.shape for shard in rows.addressable_shards} == {(len(rows), 4
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [4, 8])
-def test_the_estimate_is_the_same_on_any_number_of_devices(count, quickly_compiled):
-    flags = f"--xla_force_host_platform_device_count={count}"
+def test_the_estimate_is_the_same_on_any_number_of_devices(count, devices):
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT, str(count)],
         capture_output=True,
         text=True,
-        env={**os.environ, **quickly_compiled, "XLA_FLAGS": flags},
+        env=devices(count),
     )
     assert done.returncode == 0, done.stderr
 

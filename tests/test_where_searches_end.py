@@ -178,6 +178,27 @@ def test_a_fit_of_noisy_data_ends_soon_after_its_minimum(fit, dtype, x64):
         np.testing.assert_allclose(found, right, rtol=0.1)
 
 
+def test_a_fit_ends_soon_after_rounding_is_all_that_is_left():
+    """Steps of a few roundings of the parameters, which come to nothing, are no failures."""
+    seen = []
+
+    @sd.black_box(out=jax.ShapeDtypeStruct(TIMES.shape, jnp.float32))
+    def residuals(y):
+        row = y[0] * np.exp(-y[1] * TIMES) - 2 * np.exp(-0.7 * TIMES)
+        seen.append(np.linalg.norm(row))
+        return row.astype(y.dtype)
+
+    for seed in range(3):
+        seen.clear()
+        key = jax.random.key(seed)
+        y0 = 1 + jax.random.uniform(key, (2,)) / 2
+        result = sd.least_squares(lambda y, args: residuals(y), y0, key=key)
+        assert result.reason == "converged"
+        np.testing.assert_allclose(result.y, [2.0, 0.7], rtol=1e-6)
+        reached = np.argmax(np.array(seen) <= 1e-6 * seen[0])
+        assert 5 < reached < len(seen) <= reached + 12
+
+
 @pytest.mark.slow
 def test_so_many_evaluations_at_once_end_a_search_after_a_few_steps():
     """Not after one that is no lower, and not never."""

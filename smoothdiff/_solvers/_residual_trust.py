@@ -19,7 +19,14 @@ from smoothdiff._products import dot
 from smoothdiff._solvers._at_once import beside, radii
 from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._history import History
-from smoothdiff._solvers._ratio_test import TELLING, ratio_test, settled, taken_by_rounding
+from smoothdiff._solvers._ratio_test import (
+    INSIDE,
+    TELLING,
+    lost_in_rounding,
+    ratio_test,
+    settled,
+    taken_by_rounding,
+)
 
 # evaluations that a fit may use for each parameter, and how far they count, in radii
 _USED, _REACH, _FARTHEST = 3, 1.5, 2.0
@@ -57,8 +64,8 @@ class Proposal(NamedTuple):
     """Points to evaluate, in units of sigma, and what the model says of them.
 
     The `others` are no steps, see `beside`. The first is a `check` where the model asks for
-    nothing. A step of one sigma, or as long as the radius if that is more, would reduce the loss by
-    what is `ahead`.
+    nothing; what it promises may be `lost` in rounding. A step of one sigma, or as long as the
+    radius if that is more, would reduce the loss by what is `ahead`.
     """
 
     points: Float[Array, "K n"]
@@ -70,6 +77,7 @@ class Proposal(NamedTuple):
     jacobian: Float[Array, "n P"]
     poor: Bool[Array, ""]
     check: Bool[Array, ""]
+    lost: Bool[Array, ""]
 
 
 class TrustRegion(eqx.Module):
@@ -120,6 +128,7 @@ class TrustRegion(eqx.Module):
             jacobian=self.jacobian,
             poor=jnp.asarray(False),
             check=jnp.asarray(False),
+            lost=jnp.asarray(False),
         )
 
     def failed(self) -> Bool[Array, ""]:
@@ -181,7 +190,11 @@ class TrustRegion(eqx.Module):
         points, others = beside(first, steps[0], self.radius, inside, count, turn)
         reduction = reduction.at[0].set(jnp.where(improve, 0, reduction[0]))
         predicted = row[None] + change
-        return Proposal(points, others, predicted, reduction, slope, ahead, jacobian, poor, check)
+        # a step that the radius made short may be a first one
+        lost = lost_in_rounding(sigma * first[0], center) & ~improve
+        lost &= jnp.linalg.norm(first[0]) < INSIDE * self.radius
+        said = ahead, jacobian, poor, check, lost
+        return Proposal(points, others, predicted, reduction, slope, *said)
 
     def _fit(
         self, history: History, center: Array, row: Array, sigma: Array
@@ -235,7 +248,8 @@ class TrustRegion(eqx.Module):
         best = jnp.argmin(funs)
         # what rounding may do says nothing against the model
         fun, promise = funs[best], proposal.reduction[best]
-        reduction = jnp.where(promise > 2 * jnp.finfo(row.dtype).eps * before, promise, 0)
+        little = proposal.lost | ~(promise > 2 * jnp.finfo(row.dtype).eps * before)
+        reduction = jnp.where(little, 0, promise)
         length: Array = jnp.linalg.norm(proposal.points[best])
         tiny = jnp.finfo(row.dtype).tiny
         off = jnp.linalg.norm(rows[best] - proposal.predicted[best])
@@ -278,7 +292,8 @@ class TrustRegion(eqx.Module):
                 (lowest < (1 - _LITTLE) * before) | grow | check.right, 0, self.slow + len(rows)
             ),
             worked=self.worked | (tried & ~failed),
-            settled=check.right | settled(self.settled, outcome, length, tested[best]),
+            settled=check.right
+            | settled(self.settled | proposal.lost, outcome, length, tested[best]),
             right=check.right,
             foreseen=jnp.where(grow, jnp.maximum(self.foreseen, length), self.foreseen),
         )
