@@ -1,11 +1,10 @@
 r"""Gauss-Newton within a trust region, one evaluation a step: while a local model predicts.
 
-Around the best point the residuals are modelled as $r + J u$. J is the weighted least-squares fit
-to the nearest evaluations that differs least from the last J, so n + 1 evaluations are enough to
-begin with, and each one after it makes the model better where the search goes.
+Around the best point the residuals are modelled as $r + J u$, with J of `nearest_fit`. So n + 1
+evaluations are enough to begin with.
 
 Source: own; the first points and the ratio test are those of DFO-LS (Cartis, Fiala, Marteau and
-Roberts, 2019), the least change is Broyden's.
+Roberts, 2019).
 """
 
 from typing import NamedTuple
@@ -19,6 +18,7 @@ from smoothdiff._products import dot
 from smoothdiff._solvers._at_once import beside, radii
 from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._history import History
+from smoothdiff._solvers._nearest_fit import nearest_fit
 from smoothdiff._solvers._ratio_test import (
     INSIDE,
     TELLING,
@@ -28,10 +28,6 @@ from smoothdiff._solvers._ratio_test import (
     taken_by_rounding,
 )
 
-# evaluations that a fit may use for each parameter, and how far they count, in radii
-_USED, _REACH, _FARTHEST = 3, 1.5, 2.0
-# what is not known of a direction that hardly any evaluation has, against the others, squared
-_RIDGE = 1e-8
 # the radius grows only if the change of the residuals was predicted with an error below this share
 _PREDICTED = 0.5
 # a model is right about a check whose change it predicted with an error below this share
@@ -40,10 +36,6 @@ _RIGHT = 0.1
 _NEXT = 0.8
 # a check that changes hardly anything is followed by one so many times as far away, within sigma
 _FARTHER = 4.0
-# a direction with less than this share of the radius is not covered by evaluations
-_COVERED = 0.2
-# ... and evaluations cover the region, or this share of what the fit uses
-_CLOSE = 0.05
 # a model that holds no further than so many sigmas may be that of a ripple
 _RIPPLE = 0.01
 # the radius after a failure, in lengths of the step
@@ -167,7 +159,9 @@ class TrustRegion(eqx.Module):
 
         So many points, after as many evaluations as `turn` says.
         """
-        jacobian, lacking, poor = self._fit(history, center, row, sigma)
+        jacobian, lacking, poor = nearest_fit(
+            history, center, row, sigma, self.radius, self.jacobian
+        )
         hessian, grad = dot(jacobian, jacobian.T), dot(jacobian, row)
         tried = jnp.append(radii(self.radius, count), jnp.maximum(self.radius, 1))
         steps = jax.vmap(lambda radius: bounded_step(hessian, grad, radius, *sides))(tried)
@@ -195,40 +189,6 @@ class TrustRegion(eqx.Module):
         lost &= jnp.linalg.norm(first[0]) < INSIDE * self.radius
         said = ahead, jacobian, poor, check, lost
         return Proposal(points, others, predicted, reduction, slope, *said)
-
-    def _fit(
-        self, history: History, center: Array, row: Array, sigma: Array
-    ) -> tuple[Array, Array, Array]:
-        """The Jacobian; the direction that is covered least, and whether that is too little."""
-        n = len(center)
-        tiny = jnp.finfo(row.dtype).tiny
-        away = (history.points - center[None]) / sigma[None]
-        all_of_them = jnp.where(history.valid, jnp.linalg.norm(away, axis=1), jnp.inf)
-        count = min(_USED * (n + 1), len(away))
-        nearest: Array
-        nearest, near = jax.lax.top_k(-jnp.asarray(all_of_them), count)
-        distance = -nearest
-        # as wide as n evaluations, the center not counted, or the whole region
-        farthest = jnp.max(jnp.where(jnp.isfinite(distance[: n + 1]), distance[: n + 1], 0))
-        width = jnp.maximum(jnp.maximum(self.radius, farthest), tiny)
-        used = distance <= _FARTHEST * width
-        far = jnp.asarray(jnp.where(used, distance, 0)) / width
-        weight = jnp.where(used, 1 / (1 + (far / _REACH) ** 4), 0)
-        a = jnp.where(used[:, None], away[near], 0) / width
-        change = jnp.where(used[:, None], history.rows[near] - row[None], 0)
-        # by singular values, since squares of them would take half of the digits
-        root = jnp.sqrt(weight)
-        left, values, right = jnp.linalg.svd(a * root[:, None], full_matrices=False)
-        ridge = _RIDGE * jnp.sum(values**2) / n + tiny
-        inverse = dot(right.T, (values / (values**2 + ridge))[:, None] * (left * root[:, None]).T)
-        old = self.jacobian * width
-        correction = dot(inverse, change - dot(a, old))
-        new = jnp.where(jnp.all(jnp.isfinite(correction)), old + correction, old)
-        jacobian = jnp.asarray(new) / width
-        close = far <= _FARTHEST * jnp.maximum(self.radius / width, _CLOSE)
-        covered, directions = jnp.linalg.eigh(dot(jnp.where(close[:, None], a, 0).T, a))
-        least = jnp.sqrt(jnp.maximum(covered[0], 0))
-        return jacobian, directions[:, 0], least < _COVERED * self.radius / width
 
     def revise(
         self,
