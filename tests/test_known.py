@@ -48,8 +48,9 @@ def offsets(y):
     return y - BEST + np.sin(y)
 
 
-@pytest.mark.parametrize("call", quick_of([sd.minimise, sd.least_squares], [sd.minimise]))
-@pytest.mark.parametrize("y0", quick_of([1, 2], [1]))
+@pytest.mark.slow
+@pytest.mark.parametrize("call", [sd.minimise, sd.least_squares])
+@pytest.mark.parametrize("y0", [1, 2])
 def test_a_range_is_known_after_each_of_its_numbers(call, y0):
     fun = Counted(lambda y: 0.5 + (y[0] - 4) ** 2)
     result = call(sd.black_box(fun), y0, key=KEY, space=sd.Integer(1, 5))
@@ -190,7 +191,7 @@ def test_numbers_of_different_types_have_names_of_their_own():
         np.testing.assert_array_equal(known.rows(points, unused), [[1.0], [2.0]])
 
 
-@pytest.mark.parametrize("limit", [20, 25])
+@pytest.mark.parametrize("limit", quick_of([20, 25], [20]))
 def test_a_limit_holds_where_points_are_known(limit):
     fun = Counted(bowl)
     result = sd.minimise(sd.black_box(fun), START, key=KEY, space=GRID, max_evaluations=limit)
