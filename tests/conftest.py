@@ -95,7 +95,7 @@ def quickly_compiled():
 
 @pytest.fixture(scope="session")
 def devices(quickly_compiled):
-    """The same, of a process that has so many devices."""
+    """Makes the environment of a process that compiles so, and has so many devices."""
 
     def of(count):
         flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={count}"
@@ -144,7 +144,8 @@ def forget_compiled(request):
     quickly = compiles_quickly(request.config, request.module.__name__)
     if Process.quickly not in (quickly, None) or memory() > Process.limit:
         jax.clear_caches()
-        Process.limit = max(Process.limit, memory() + MORE)
+        if math.isfinite(memory()):
+            Process.limit = max(Process.limit, memory() + MORE)
     Process.quickly = quickly
     jax.config.update("jax_disable_most_optimizations", quickly)
 

@@ -199,6 +199,15 @@ def test_a_fit_ends_soon_after_rounding_is_all_that_is_left():
         assert 5 < reached < len(seen) <= reached + 12
 
 
+def test_a_wrong_model_that_asks_for_a_tiny_step_has_not_converged():
+    # the penalty beyond the jump makes the slope so steep that the step is lost in rounding
+    fun = lambda y, args: jnp.where(y >= 1, y, 1e8)
+    result = sd.least_squares(
+        fun, jnp.asarray(2.0), key=jax.random.key(0), solver=sd.GaussNewton(0.5)
+    )
+    assert float(result.y) == pytest.approx(1, abs=0.01)
+
+
 @pytest.mark.slow
 def test_so_many_evaluations_at_once_end_a_search_after_a_few_steps():
     """Not after one that is no lower, and not never."""

@@ -1,8 +1,9 @@
-r"""The Jacobian of the nearest evaluations: a least-squares fit that changes the last one least.
+r"""The Jacobian of the nearest evaluations: the fit that changes the last Jacobian least.
 
 $$ \min_J \; \sum_i w_i \, |r_i - r - J (x_i - x)|^2 + \epsilon \, |J - J_{last}|^2 $$
 
-Each evaluation makes it better where a search goes.
+x is the best point and r its residuals; the weights fall with the distance from it. Each
+evaluation makes J better where a search goes.
 
 Source: own; the least change is Broyden's.
 """

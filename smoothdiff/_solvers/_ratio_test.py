@@ -5,8 +5,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-# the acceptance ratio of a step that fails, and of one after which the radius may grow
-_FAILED, _HELD = 0.1, 0.7
+# a step fails at this acceptance ratio; above the other one the radius may grow
+LEAST, _HELD = 0.1, 0.7
 # a step that raises the function by so many times the predicted reduction was far too long
 _FAR_OFF = 10.0
 # a step of this share of the radius would have been longer without it
@@ -69,7 +69,7 @@ def ratio_test(
     """
     tried = reduction > 0
     ratio = jnp.where(tried, (before - fun) / jnp.where(tried, reduction, 1), 0)
-    failed = tried & ~(ratio > _FAILED)
+    failed = tried & ~(ratio > LEAST)
     long = failed & jnp.isfinite(ratio) & (ratio < -_FAR_OFF)
     count = jnp.where(failed & ~long, fails + 1, jnp.where(tried & ~failed, 0, fails))
     more = reduction > taken_by_rounding(before)

@@ -1,7 +1,7 @@
 r"""Gauss-Newton within a trust region, one evaluation a step: while a local model predicts.
 
-Around the best point the residuals are modelled as $r + J u$, with J of `nearest_fit`. So n + 1
-evaluations are enough to begin with.
+Around the best point the residuals are modelled as $r + J u$. J is that of `nearest_fit`, which
+changes the last one least, so n + 1 evaluations are enough to begin with.
 
 Source: own; the first points and the ratio test are those of DFO-LS (Cartis, Fiala, Marteau and
 Roberts, 2019).
@@ -21,7 +21,9 @@ from smoothdiff._solvers._history import History
 from smoothdiff._solvers._nearest_fit import nearest_fit
 from smoothdiff._solvers._ratio_test import (
     INSIDE,
+    LEAST,
     TELLING,
+    is_narrow,
     lost_in_rounding,
     ratio_test,
     settled,
@@ -56,8 +58,8 @@ class Proposal(NamedTuple):
     """Points to evaluate, in units of sigma, and what the model says of them.
 
     The `others` are no steps, see `beside`. The first is a `check` where the model asks for
-    nothing; what it promises may be `lost` in rounding. A step of one sigma, or as long as the
-    radius if that is more, would reduce the loss by what is `ahead`.
+    nothing. A step may be `lost` in the rounding of the parameters. One of a sigma, or as long as
+    the radius if that is more, would reduce the loss by what is `ahead`.
     """
 
     points: Float[Array, "K n"]
@@ -69,7 +71,7 @@ class Proposal(NamedTuple):
     jacobian: Float[Array, "n P"]
     poor: Bool[Array, ""]
     check: Bool[Array, ""]
-    lost: Bool[Array, ""]
+    lost: Bool[Array, " M"]
 
 
 class TrustRegion(eqx.Module):
@@ -120,7 +122,7 @@ class TrustRegion(eqx.Module):
             jacobian=self.jacobian,
             poor=jnp.asarray(False),
             check=jnp.asarray(False),
-            lost=jnp.asarray(False),
+            lost=jnp.zeros(tried, bool),
         )
 
     def failed(self) -> Bool[Array, ""]:
@@ -184,9 +186,9 @@ class TrustRegion(eqx.Module):
         points, others = beside(first, steps[0], self.radius, inside, count, turn)
         reduction = reduction.at[0].set(jnp.where(improve, 0, reduction[0]))
         predicted = row[None] + change
+        lost = jax.vmap(lambda step: _is_lost(step, center, sigma))(steps)
         # a step that the radius made short may be a first one
-        lost = lost_in_rounding(sigma * first[0], center) & ~improve
-        lost &= jnp.linalg.norm(first[0]) < INSIDE * self.radius
+        lost &= (jnp.linalg.norm(steps, axis=1) < INSIDE * tried[:-1]) & ~improve
         said = ahead, jacobian, poor, check, lost
         return Proposal(points, others, predicted, reduction, slope, *said)
 
@@ -206,9 +208,11 @@ class TrustRegion(eqx.Module):
         funs = jnp.where(good, jnp.sum(rows**2, axis=1) / 2, jnp.inf)
         lowest, funs = jnp.min(funs), jnp.where(proposal.others, jnp.inf, funs)
         best = jnp.argmin(funs)
-        # what rounding may do says nothing against the model
+        # what rounding may do says nothing against a model whose last steps came true
         fun, promise = funs[best], proposal.reduction[best]
-        little = proposal.lost | ~(promise > 2 * jnp.finfo(row.dtype).eps * before)
+        reached = before - fun > LEAST * promise
+        lost = proposal.lost[best] & self.settled & jnp.isfinite(fun) & ~reached
+        little = lost | ~(promise > 2 * jnp.finfo(row.dtype).eps * before)
         reduction = jnp.where(little, 0, promise)
         length: Array = jnp.linalg.norm(proposal.points[best])
         tiny = jnp.finfo(row.dtype).tiny
@@ -238,7 +242,7 @@ class TrustRegion(eqx.Module):
         radius = jnp.where(grow, jnp.maximum(radius, 2 * length), radius)
         check = self._checked(proposal, row, rows[0], good[0] & compared)
         after = jnp.minimum(check.factor * radius, jnp.maximum(radius, 1))
-        radius = jnp.where(~tried & ~self.improve, after, radius)
+        radius = jnp.where(~tried & ~self.improve & ~lost, after, radius)
         improve = failed & proposal.poor & ~self.improve
         revised = TrustRegion(
             radius=radius,
@@ -252,8 +256,7 @@ class TrustRegion(eqx.Module):
                 (lowest < (1 - _LITTLE) * before) | grow | check.right, 0, self.slow + len(rows)
             ),
             worked=self.worked | (tried & ~failed),
-            settled=check.right
-            | settled(self.settled | proposal.lost, outcome, length, tested[best]),
+            settled=check.right | settled(self.settled, outcome, length, tested[best]),
             right=check.right,
             foreseen=jnp.where(grow, jnp.maximum(self.foreseen, length), self.foreseen),
         )
@@ -277,6 +280,11 @@ class TrustRegion(eqx.Module):
         nothing = (jnp.abs(rise) <= little) & (foreseen <= little) & jnp.any(there != row)
         farther = (proposal.check & good & nothing) | (known & ~right)
         return _Check(right, jnp.where(right, _NEXT, jnp.where(farther, _FARTHER, 0.5)))
+
+
+def _is_lost(step: Array, center: Array, sigma: Array) -> Array:
+    """Whether it is short beside sigma, and of so few roundings that it may come to nothing."""
+    return is_narrow(jnp.linalg.norm(step)) & lost_in_rounding(sigma * step, center)
 
 
 class _Check(NamedTuple):

@@ -101,10 +101,11 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             tried may be anything.
         rtol: relative tolerance. The run has converged when three steps in a row are shorter than
             the tolerance, for each parameter atol + rtol max(|y|, sigma), unless only the radius
-            made them short, or they failed where the model promised more than rounding may take. A
-            check whose residuals came as predicted counts as such a step. Where no step as long as
-            a hundredth of sigma was predicted, and more than a tenth of the first loss is left,
-            that may be a ripple's minimum: wide rounds look around first.
+            made them short, or they failed where the model promised more than rounding may take.
+            After steps that came true none of a few roundings of y fails. A check whose residuals
+            came as predicted counts as such a step. Where no step as long as a hundredth of sigma
+            was predicted, and more than a tenth of the first loss is left, that may be a ripple's
+            minimum: wide rounds look around first.
         atol: absolute tolerance. With both zero no run converges; else the tolerance is at least
             the root of the rounding of max(|y|, sigma). With batches steps and tolerances are
             compared by their norms, without sigma.

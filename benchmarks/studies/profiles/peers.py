@@ -26,7 +26,8 @@ def dfo_ls(seen: Seen, noise: bool) -> None:
 
 def differences(seen: Seen) -> None:
     """Two-point ones, for a trust-region Gauss-Newton."""
-    optimize.least_squares(seen, seen.case.start)
+    bounds = (-np.inf, np.inf) if seen.case.bounds is None else seen.case.bounds
+    optimize.least_squares(seen, seen.case.start, bounds=bounds)
 
 
 def py_bobyqa(seen: Seen) -> None:

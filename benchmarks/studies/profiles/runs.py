@@ -60,7 +60,7 @@ def loss(exact: np.ndarray) -> float:
 
 
 def trace(method: Method, case: Case, budget: int) -> dict[str, Any]:
-    """What the method found, and after how many evaluations; and what ended it."""
+    """What the method found, after how many evaluations; how many it took, and what ended it."""
     ignoring = warnings.catch_warnings(action="ignore")
     with ignoring, np.errstate(all="ignore"), redirect_stdout(StringIO()):
         seen, ended = Seen(case, budget), "by itself"
@@ -77,5 +77,6 @@ def trace(method: Method, case: Case, budget: int) -> dict[str, Any]:
         "evaluations": np.array(seen.evaluations, int),
         "values": np.array(seen.values, float),
         "start": loss(seen.at_start),
+        "count": seen.count,
         "ended": ended,
     }
