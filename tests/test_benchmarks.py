@@ -367,6 +367,7 @@ def test_a_family_shares_a_table_and_a_picture(monkeypatch, tmp_path, capsys):
         assert (tmp_path / "bowls" / picture).read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_all_scenes_are_run_and_failures_are_named(monkeypatch, tmp_path, capsys):
     def dark(full):
         raise NotAble("it lacks light")

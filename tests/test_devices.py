@@ -10,6 +10,7 @@ import pytest
 
 import smoothdiff as sd
 from smoothdiff import _devices
+from tests.parts import quick_of
 
 SCRIPT = """
 import os, sys, tempfile
@@ -77,7 +78,7 @@ def test_steps_are_on_the_cpu_and_the_function_is_where_jax_is(devices):
     assert ran.returncode == 0, ran.stderr.decode()
 
 
-@pytest.mark.parametrize("no_cpu", [False, True])
+@pytest.mark.parametrize("no_cpu", quick_of([False, True], [False]))
 def test_steps_that_are_moved_are_the_same(monkeypatch, no_cpu):
     residuals = lambda y, args: jnp.append(jnp.sin(y) - 0.3, y[0] * y[1])
 

@@ -25,8 +25,14 @@ PUBLIC = {
 }
 # modules of optional extras import what the test extra brings
 EXAMPLES = ["smoothdiff", *MODULES]
-# whole runs that take long to compile; `minimise` and `least_squares` have quicker ones
-WHOLE_RUNS = (
+# whole runs and much else that takes long to compile, of which other tests are quicker
+COMPILED = (
+    "_samplers",
+    "_support",
+    "_filtered_adam",
+    "_importance",
+    "_aggregate",
+    "filters.mesh",
     "_solvers.",
     "_minimise",
     "_search",
@@ -37,7 +43,7 @@ WHOLE_RUNS = (
     "_with_cov",
     "plot",
 )
-LONG = [name for name in MODULES if name.removeprefix("smoothdiff.").startswith(WHOLE_RUNS)]
+LONG = [name for name in MODULES if name.removeprefix("smoothdiff.").startswith(COMPILED)]
 
 
 @pytest.mark.parametrize("name", sd.__all__)

@@ -147,7 +147,13 @@ def test_a_zero_of_all_residuals_ends_a_look():
     assert np.sum(np.any(np.array(points) < 0.8, axis=1)) == 2
 
 
-@each
+@pytest.mark.parametrize(
+    ("call", "solver", "fun"),
+    [
+        pytest.param(*CASES[0], id="number", marks=pytest.mark.slow),
+        pytest.param(*CASES[1], id="residuals"),
+    ],
+)
 def test_failures_elsewhere_end_nothing(call, solver, fun):
     fails = lambda y, args: jnp.where(jnp.all(y > 0.85), fun(y), jnp.nan)
     result = call(fails, START, solver=solver(0.01), key=jax.random.key(0), bounds=(LOW, HIGH))

@@ -318,7 +318,10 @@ def root(y):
         return np.sqrt(y[0]) + y[1] ** 2
 
 
-@pytest.mark.parametrize("where", [{}, {"bounds": (-1.0, 2.0)}, {"space": sd.Range(-1.0, 2.0)}])
+WHERE = [{}, {"bounds": (-1.0, 2.0)}, {"space": sd.Range(-1.0, 2.0)}]
+
+
+@pytest.mark.parametrize("where", quick_of(WHERE, [{}]))
 @pytest.mark.parametrize("fails", quick_of([radius, root], [root]))
 def test_a_point_where_a_black_box_fails_leads_to_bounds_if_there_are_none(fails, where):
     box = sd.black_box(fails, jnp.float32(0))

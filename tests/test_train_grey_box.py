@@ -163,6 +163,7 @@ def test_a_callback_and_ctrl_c_end_it_with_what_there_is():
     assert (result.reason, result.evaluations) == ("interrupted", 16 * 2 * EACH)
 
 
+@pytest.mark.slow
 def test_a_black_box_that_breaks_loses_nothing(tmp_path):
     calls = []
 

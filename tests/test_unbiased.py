@@ -79,7 +79,7 @@ PRECISION = {
     64: (1024, 0.06),
 }
 # 24 are enough for a full quadratic fit of pairs; two are one group of pairs, of frames
-QUICK = [(name, 24) for name in [*list(SAMPLERS)[::3], *NEW]]
+QUICK = [(name, 24) for name in [*list(SAMPLERS)[::5], *NEW]]
 QUICK += [("aggregate 2, quasi", 2)]
 SAMPLERS |= NEW
 # one set that is even as a whole is fitted as a whole, which is biased

@@ -11,7 +11,6 @@ from smoothdiff._params import take_apart
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._ratio_test import is_lower, rounding_alone
 from smoothdiff._solvers._residual_search import ResidualSearch
-from tests.parts import quick_of
 
 PIXELS = np.linspace(0, 1, 32)
 
@@ -157,8 +156,9 @@ FITS = {
 }
 
 
-@pytest.mark.parametrize("dtype", quick_of([jnp.float32, jnp.float64], [jnp.float64]))
-@pytest.mark.parametrize("fit", quick_of(FITS, ["polynomial"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("fit", FITS)
 def test_a_fit_of_noisy_data_ends_soon_after_its_minimum(fit, dtype, x64):
     """The model asks for nothing, and is right about points beside: no more is needed."""
     n, most, curve = FITS[fit]
