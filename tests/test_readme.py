@@ -15,6 +15,7 @@ from pages import DOCS, README, ROOT
 import smoothdiff as sd
 from benchmarks import __main__ as cli
 from benchmarks import _registry
+from benchmarks.studies import profiles
 from benchmarks.studies.zerograds import ablations
 from smoothdiff.renderers import mitsuba
 
@@ -144,7 +145,7 @@ def test_commands_are_understood(page):
         # any task stands for all where a page says TASK
         options = cli.parser().parse_args(re.sub(r"\bTASK\b", "led", said).split())
         methods = getattr(options, "methods", None)
-        known = {*_registry.methods(), *ablations.methods()}
+        known = {*_registry.methods(), *profiles.METHODS, *ablations.methods()}
         assert not methods or set(methods.split(",")) <= known, said
 
 
