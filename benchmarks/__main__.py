@@ -20,6 +20,7 @@ FLAGS: dict[str, dict] = {
     "seeds": {"type": int, "metavar": "N", "help": "number of starts"},
     "fresh": {"action": "store_true", "help": "run again what has been run"},
     "methods": {"metavar": "A,B", "help": "these, separated by commas"},
+    "jobs": {"type": int, "metavar": "N", "default": 1, "help": "processes side by side"},
     "tuned": {"action": "store_true", "help": "also at the best of a grid, on other starts"},
     "compare": {"action": "store_true", "help": "show the committed results too"},
     "runs": {"action": "store_true", "help": "of what was run here, not of what is committed"},

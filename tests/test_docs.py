@@ -25,8 +25,8 @@ PUBLIC = {
 }
 # modules of optional extras import what the test extra brings
 EXAMPLES = ["smoothdiff", *MODULES]
-# whole runs and much else that takes long to compile, of which other tests are quicker
-COMPILED = (
+# modules whose examples are whole runs, or take long to compile: the slow part has them
+LONG_ONES = (
     "_samplers",
     "_support",
     "_filtered_adam",
@@ -43,7 +43,7 @@ COMPILED = (
     "_with_cov",
     "plot",
 )
-LONG = [name for name in MODULES if name.removeprefix("smoothdiff.").startswith(COMPILED)]
+LONG = [name for name in MODULES if name.removeprefix("smoothdiff.").startswith(LONG_ONES)]
 
 
 @pytest.mark.parametrize("name", sd.__all__)

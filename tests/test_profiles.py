@@ -2,6 +2,7 @@
 
 import json
 from argparse import Namespace
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -111,6 +112,9 @@ def test_an_error_of_a_method_ends_its_run_and_a_missing_package_the_method():
         trace(Method("Absent", False, absent, ""), bowl(), 10)
 
 
+QUICK = {"full": False, "fresh": False, "methods": None, "names": [], "jobs": 1, "said": "profiles"}
+
+
 def toy(full):
     yield Panel("scalars", "Bowls", [bowl(1, name="one"), bowl(2, name="two")], (10, 40))
     yield Panel("residuals", "Equations", [equations()], (10,))
@@ -130,7 +134,7 @@ def test_a_run_is_written_shown_and_taken_up_again(tmp_path, monkeypatch, capsys
     methods["absent"] = Method("Absent", False, absent, "")
     monkeypatch.setattr(profiles, "METHODS", methods)
     monkeypatch.setattr(profiles, "SETS", {"toy": toy})
-    options = Namespace(full=False, fresh=False, methods=None, names=[], said="profiles")
+    options = Namespace(**QUICK)
     _study.run(profiles, options, tmp_path)
     assert calls == ["one", "two", "equations"]
     results = json.loads((tmp_path / "results.json").read_text())
@@ -149,6 +153,29 @@ def test_a_run_is_written_shown_and_taken_up_again(tmp_path, monkeypatch, capsys
     assert again["panels"] == results["panels"]
     with pytest.raises(SystemExit, match="choose from toy"):
         profiles.measure(Namespace(**{**vars(options), "names": ["toys"]}), tmp_path)
+
+
+class Thread(ThreadPoolExecutor):
+    """One thread in place of processes, which would not know the toys."""
+
+    def __init__(self, jobs, context, initializer, arguments):
+        super().__init__(1)
+
+
+def test_processes_that_share_the_runs_make_each_once(tmp_path, monkeypatch):
+    calls = []
+    simplex = peers.METHODS["nelder_mead"]
+    counted = lambda seen: (calls.append(seen.case.name), simplex.search(seen))
+    methods = {"nelder_mead": simplex._replace(search=counted)}
+    monkeypatch.setattr(profiles, "METHODS", methods)
+    monkeypatch.setattr(profiles, "SETS", {"toy": toy})
+    monkeypatch.setattr(profiles, "ProcessPoolExecutor", Thread)
+    alone = profiles.measure(Namespace(**QUICK), tmp_path / "alone")
+    shared = Namespace(**{**QUICK, "jobs": 2, "fresh": True})
+    assert profiles.measure(shared, tmp_path) == alone
+    assert sorted(calls) == ["one", "one", "two", "two"]
+    profiles.measure(shared, tmp_path)  # anew, as it was asked
+    assert len(calls) == 6
 
 
 @pytest.mark.parametrize("name", list(peers.METHODS))

@@ -33,9 +33,18 @@ def nearest_fit(
     radius: Float[Array, ""],
     last: Float[Array, "n P"],
 ) -> tuple[Float[Array, "n P"], Float[Array, " n"], Bool[Array, ""]]:
-    """The Jacobian; the direction that is covered least, and whether that is too little.
+    """The Jacobian, and whether evaluations cover the region around its center.
 
-    Lengths are in units of sigma, and so are the Jacobian and the last one.
+    Args:
+        history: evaluations, of which the nearest are used.
+        center: the best point.
+        row: its residuals.
+        sigma: the unit of length, for each parameter.
+        radius: of the region, in units of sigma.
+        last: the Jacobian before, in units of sigma, as the one that is returned.
+
+    Returns:
+        The Jacobian; the unit direction that is covered least; whether that is too little.
     """
     n = len(center)
     tiny = jnp.finfo(row.dtype).tiny

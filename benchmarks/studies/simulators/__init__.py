@@ -1,9 +1,9 @@
 """Simulators with known answers, as a user has them: ours against other libraries, in evaluations.
 
 Each is given in unit coordinates within its box, from random starts. Residuals are what it returns
-less what it returns at the answer. Methods for residuals see these, the others the sum of
-their squares. None of them is told anything else. A run is scored by the sum of squares over that
-at its start.
+less what it returns at the answer. Methods for residuals see these, the others the sum of their
+squares. None of them is told anything else. A run is scored by the sum of squares over that at its
+start.
 """
 
 import math
@@ -22,7 +22,7 @@ from benchmarks._grid import Grid, Row, short
 from benchmarks._names import name_of
 from benchmarks._summary import cost_to_level
 from benchmarks._task import NotAble, precision
-from benchmarks.studies.profiles import ours, peers
+from benchmarks.studies.profiles import METHODS, behaviour_of, chosen
 from benchmarks.studies.profiles.problems import Case
 from benchmarks.studies.profiles.runs import Method, trace
 from benchmarks.studies.simulators.programs import SIMULATORS, Simulator
@@ -33,34 +33,36 @@ STARTS = {False: 2, True: 10}
 BUDGET = 400  # evaluations
 WIDTH = 0.1  # of the box: where other libraries begin
 LEVELS = ("0.01", "0.0001")  # of the loss at the start
-CHOSEN = ("dfo_ls", "dfo_ls_noise", "least_squares", "py_bobyqa", "nelder_mead", "bipop_cma_es")
-METHODS: dict[str, Method] = {
-    **{name: ours.METHODS[name] for name in ("gauss_newton", "newton_cg")},
-    **{name: peers.METHODS[name] for name in CHOSEN},
-}
+# those that run where none are named
+FIRST = (
+    *("gauss_newton", "newton_cg", "dfo_ls", "dfo_ls_noise", "least_squares"),
+    *("py_bobyqa", "nelder_mead", "bipop_cma_es"),
+)
 
 
 def measure(options: Namespace, folder: Path) -> dict[str, Any]:
     """What each method takes on each simulator, from each start."""
-    wanted = options.methods.split(",") if options.methods else [*METHODS]
-    for name in [n for n in options.names if n not in SIMULATORS]:
-        raise SystemExit(f"There is no {name!r}; choose from {', '.join(SIMULATORS)}.")
-    simulators = options.names or [*SIMULATORS]
+    asked = options.methods.split(",") if options.methods else [*FIRST]
+    methods: dict[str, Method] = chosen(METHODS, asked)
+    simulators: dict[str, Simulator] = chosen(SIMULATORS, options.names)
     seeds = range(options.seeds or STARTS[options.full])
     missing: dict[str, str] = {}
     found: dict[str, dict[str, Any]] = {}
     with precision("float64"):
-        for name in tqdm(simulators, unit="simulator"):
+        for name, simulator in tqdm(simulators.items(), unit="simulator"):
             found[name] = {}
-            for method in (n for n in wanted if n not in missing):
+            for method in (n for n in methods if n not in missing):
+                kept = folder / "runs" / name / method
                 try:
-                    path = folder / "runs" / name
-                    runs = [made(method, SIMULATORS[name], seed, path, options) for seed in seeds]
+                    runs = [
+                        made(methods[method], simulator, seed, kept, options.fresh)
+                        for seed in seeds
+                    ]
                     found[name][method] = scored(runs)
                 except NotAble as reason:
                     missing[method] = str(reason)
-    titles = {name: SIMULATORS[name].title for name in simulators}
-    ran = [name for name in wanted if name not in missing]
+    titles = {name: simulator.title for name, simulator in simulators.items()}
+    ran = [name for name in methods if name not in missing]
     return {
         "budget": BUDGET,
         "starts": len(seeds),
@@ -86,20 +88,15 @@ def case_of(simulator: Simulator, seed: int, residuals: bool) -> Case:
     return Case(f"{simulator.title}-{seed}", fun, start, WIDTH, box, 0.0)
 
 
-def made(
-    method: str, simulator: Simulator, seed: int, folder: Path, options: Namespace
-) -> dict[str, Any]:
+def made(how: Method, simulator: Simulator, seed: int, folder: Path, fresh: bool) -> dict[str, Any]:
     """A run that is kept, and made again if the method or the simulator changed."""
-    how = METHODS[method]
     case = case_of(simulator, seed, how.residuals)
-    seen = np.asarray(case.fun(case.start))
-    stale = fingerprint(how.source, BUDGET, case.start, seen)
-    path = folder / f"{method}-{seed}.npz"
-    return cached(path, stale, partial(trace, how, case, BUDGET), options.fresh)
+    stale = fingerprint(behaviour_of(case), how.source, BUDGET)
+    return cached(folder / f"{seed}.npz", stale, partial(trace, how, case, BUDGET), fresh)
 
 
 def scored(runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Evaluations to each level and in all, infinite where it is not reached, and what is left."""
+    """Evaluations to each level and in all, infinite where it is not reached."""
     shares = [np.asarray(each["values"], float) / each["start"] for each in runs]
     to = lambda level: [
         cost_to_level(share, each["evaluations"], float(level))
@@ -108,7 +105,6 @@ def scored(runs: list[dict[str, Any]]) -> dict[str, Any]:
     return {
         "to": {level: to(level) for level in LEVELS},
         "count": [each["count"] for each in runs],
-        "left": [float(share.min(initial=1.0)) for share in shares],
     }
 
 
