@@ -112,10 +112,18 @@ def test_an_error_of_a_method_ends_its_run_and_a_missing_package_the_method():
         trace(Method("Absent", False, absent, ""), bowl(), 10)
 
 
-QUICK = {"full": False, "fresh": False, "methods": None, "names": [], "jobs": 1, "said": "profiles"}
+QUICK = {
+    "full": False,
+    "fresh": False,
+    "methods": None,
+    "names": [],
+    "seeds": None,
+    "jobs": 1,
+    "said": "",
+}
 
 
-def toy(full):
+def toy(full, seeds):
     yield Panel("scalars", "Bowls", [bowl(1, name="one"), bowl(2, name="two")], (10, 40))
     yield Panel("residuals", "Equations", [equations()], (10,))
 

@@ -3,8 +3,8 @@
 Methods see residuals or numbers, exact, with noise, or rounded; the exact values are scored. A
 budget counts in units of n + 1 evaluations, for BBOB of n. `python -m benchmarks profiles bbob5`
 runs one of the sets: residuals, scalars, bbob5, bbob10, bbob20 and, of COCO's large-scale suite,
-bbob160, by the number of parameters. With `--jobs 16` sixteen processes share the runs, each on one
-core.
+bbob160, by the number of parameters. `--seeds` is how many instances of BBOB's functions. With
+`--jobs 16` sixteen processes share the runs, each on one core.
 """
 
 import multiprocessing
@@ -30,7 +30,7 @@ from benchmarks.studies.profiles.shares import Runs, profile
 from benchmarks.studies.profiles.shown import draw, tables
 
 HELP = "data profiles on CUTEst and BBOB, against other libraries"
-OPTIONS = ("names", "full", "fresh", "methods", "jobs")
+OPTIONS = ("names", "full", "seeds", "fresh", "methods", "jobs")
 METHODS: dict[str, Method] = peers.METHODS | ours.METHODS
 
 
@@ -45,7 +45,7 @@ def measure(options: Namespace, folder: Path) -> dict[str, Any]:
     with precision("float64"):
         for name, build in sets.items():
             try:
-                for panel in build(options.full):
+                for panel in build(options.full, options.seeds):
                     found = of_panel(panel, methods, missing, options, folder / "runs" / name)
                     if any(found):
                         panels.append(profile(panel, found))
@@ -112,7 +112,7 @@ def side_by_side(
             jobs = [
                 pool.submit(_one, place, method, options, folder)
                 for name in sets
-                for number, panel in enumerate(_built(name, options.full))
+                for number, panel in enumerate(_built(name, options.full, options.seeds))
                 for place in product([name], [number], range(len(panel.cases)))
                 for method in methods
                 if methods[method].residuals == (panel.set == "residuals")
@@ -132,16 +132,16 @@ def _one(place: tuple[str, int, int], method: str, options: Namespace, folder: P
     """One run of a method, on a case of a panel of a set."""
     name, number, index = place
     with precision("float64"):
-        panel = _built(name, options.full)[number]
+        panel = _built(name, options.full, options.seeds)[number]
         how = chosen(METHODS, [method])
         of_case(panel, panel.cases[index], how, {}, options, folder / "runs" / name)
 
 
 @cache
-def _built(name: str, full: bool) -> list[Panel]:
+def _built(name: str, full: bool, seeds: int | None) -> list[Panel]:
     """The panels of a set, none where what they need is not there."""
     try:
-        return list(SETS[name](full))
+        return list(SETS[name](full, seeds))
     except NotAble:
         return []
 
