@@ -194,9 +194,9 @@ def test_a_function_that_falls_for_ever_has_not_converged(name):
         "root": lambda y, args: -jnp.sum(jnp.sqrt(jnp.abs(y))),
     }
     for start in (jnp.zeros(2), jnp.full(2, 0.5)):
-        found = sd.minimise(falls[name], start, key=jax.random.key(0))
-        assert found.fun < -50
-        assert found.result != optx.RESULTS.successful
+        ran = [sd.minimise(falls[name], start, key=jax.random.key(seed)) for seed in range(3)]
+        assert np.median([found.fun for found in ran]) < -50
+        assert all(found.result != optx.RESULTS.successful for found in ran)
 
 
 @pytest.mark.slow

@@ -76,18 +76,20 @@ def test_inputs_are_a_function_of_y():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
-def test_a_place_is_found_for_less_than_the_finest_level_alone(seed):
+def test_a_place_is_found_for_less_than_the_finest_level_alone():
     """To twice the squares that the noise of a photograph of its own leaves at the truth."""
     truth = jnp.array([-0.5, 0.2, 0.3])
     levels = mitsuba.levels(scene(), "ball.translate", photo(64, seed=1), spp=16)
     finest = levels[-1].fun
     target = float(jnp.sum(finest(truth, None) ** 2))
-    options = {"key": jax.random.key(seed), "bounds": (-1.0, 1.0), "target": target}
-    start = jnp.array([0.3, -0.2, 0.0])
-    found = sd.coarse_to_fine(sd.least_squares, levels, start, **options)
-    np.testing.assert_allclose(found.y, truth, atol=0.1)
-    assert found.cost < 0.75 * sd.least_squares(finest, start, **options).evaluations
+    start, costs, alone = jnp.array([0.3, -0.2, 0.0]), [], []
+    for seed in range(3):
+        options = {"key": jax.random.key(seed), "bounds": (-1.0, 1.0), "target": target}
+        found = sd.coarse_to_fine(sd.least_squares, levels, start, **options)
+        np.testing.assert_allclose(found.y, truth, atol=0.1)
+        costs.append(found.cost)
+        alone.append(sd.least_squares(finest, start, **options).evaluations)
+    assert np.median(costs) < 0.75 * np.median(alone)
 
 
 @pytest.mark.parametrize("shape", [(8, 8), (8, 8, 1)])

@@ -163,7 +163,8 @@ def test_a_step_that_comes_to_nothing_in_rounding_is_no_failure_after_steps_that
     [
         (1e-15, 1.0, 1.0, True),
         (1e-9, 1.0, 1.0, False),
-        (1e-15, 0.0, 1.0, False),
+        (1e-15, 0.0, 1.0, True),
+        (1e-12, 0.0, 1.0, False),
         (1e-15, 1.0, 5e-16, False),  # the radius made it short
         (1e-3, 1e13, 1.0, False),  # rounding is no small matter there
     ],

@@ -188,7 +188,7 @@ class QuadraticTrust(eqx.Module):
         reduction = reduction.at[0].set(jnp.where(which > 0, 0, reduction[0]))
         poor = (model.farthest > _FAR * self.radius) & (model.used > len(center) + 1)
         # a step that the radius made short may be a first one
-        lost = lost_in_rounding(self.metric.out(first), center)
+        lost = lost_in_rounding(self.metric.out(first), center, params.sigma)
         lost &= jnp.linalg.norm(first) < INSIDE * self.radius
         said = asked.tight, model.determined, lost
         return Proposal(points, others, reduction, hessian, poor, check, rise, *said)
@@ -244,7 +244,9 @@ class QuadraticTrust(eqx.Module):
         wait = proposal.poor & patient & ~long
         fails = jnp.where(wait, jnp.minimum(fails, _PATIENCE), fails)
         lower = jnp.minimum(self.radius, length) * jnp.where(long, 0.1, 0.5)
-        radius = jnp.where(failed & ~wait, lower, self.radius)
+        # nor does a failure that rounding may explain, near a minimum
+        blamed = failed & ~wait & (outcome.more | ~self.settled)
+        radius = jnp.where(blamed, lower, self.radius)
         radius = jnp.where(held, jnp.maximum(radius, 2 * length), radius)
         # where a check rose by more than rounding, the radius is not too small to tell
         tells = funs[0] - before > TELLING * jnp.finfo(fun.dtype).eps * jnp.abs(before)

@@ -16,6 +16,8 @@ _NOTHING, TELLING = 8, 1000
 # a step of so many roundings of the parameters may be lost in those of the function's own sums; in
 # float32 that would be too long a step to do without
 _LOST = {"float32": 8, "float64": 64}
+# a parameter's range in sigmas, where it is not known: those of the default sigma
+_RANGE = 5
 # a reduction of a smaller share of the value is no progress, nor one of few roundings
 _PROGRESS = 1e-8
 # points are near each other within so many sigmas
@@ -81,10 +83,16 @@ def taken_by_rounding(fun: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.sqrt(jnp.finfo(fun.dtype).eps) * jnp.abs(fun)
 
 
-def lost_in_rounding(move: Float[Array, " n"], center: Float[Array, " n"]) -> Bool[Array, ""]:
-    """Whether a step moves parameters by so few roundings that what it promises may be lost."""
+def lost_in_rounding(
+    move: Float[Array, " n"], center: Float[Array, " n"], sigma: Float[Array, " n"]
+) -> Bool[Array, ""]:
+    """Whether a step moves parameters by so few roundings that what it promises may be lost.
+
+    Of a parameter near zero they are those of its range: its own would be too short to tell, where
+    it is in one sum with others.
+    """
     roundings = _LOST[move.dtype.name] * jnp.finfo(move.dtype).eps
-    return jnp.all(jnp.abs(move) <= roundings * jnp.abs(center))
+    return jnp.all(jnp.abs(move) <= roundings * jnp.maximum(jnp.abs(center), _RANGE * sigma))
 
 
 def is_lower(fun: Float[Array, ""], before: Float[Array, ""]) -> Bool[Array, ""]:

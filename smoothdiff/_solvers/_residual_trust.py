@@ -284,7 +284,7 @@ class TrustRegion(eqx.Module):
 
 def _is_lost(step: Array, center: Array, sigma: Array) -> Array:
     """Whether it is short beside sigma, and of so few roundings that it may come to nothing."""
-    return is_narrow(jnp.linalg.norm(step)) & lost_in_rounding(sigma * step, center)
+    return is_narrow(jnp.linalg.norm(step)) & lost_in_rounding(sigma * step, center, sigma)
 
 
 class _Check(NamedTuple):
