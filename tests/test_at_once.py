@@ -13,11 +13,13 @@ from smoothdiff._solvers._at_once import beside, radii
 
 ZERO, ONE = jnp.asarray(0, jnp.int32), jnp.asarray(1.0)
 FREE = lambda points: points
+# compiled, as in a solver
+RADII, BESIDE = jax.jit(radii, static_argnums=1), jax.jit(beside, static_argnums=(3, 4))
 
 
 def test_one_evaluation_is_the_step():
-    assert radii(jnp.asarray(0.5), 1).tolist() == [0.5]
-    points, others = beside(jnp.ones((1, 3)), jnp.ones(3), ONE, FREE, 1, ZERO)
+    assert RADII(jnp.asarray(0.5), 1).tolist() == [0.5]
+    points, others = BESIDE(np.ones((1, 3), np.float32), np.ones(3, np.float32), ONE, FREE, 1, ZERO)
     assert (points.tolist(), others.tolist()) == ([3 * [1]], [False])
 
 
@@ -25,56 +27,57 @@ def test_one_evaluation_is_the_step():
     ("count", "factors"), [(2, [1]), (3, [1, 2]), (4, [1, 2]), (5, [1, 2, 0.5]), (9, [1, 2, 0.5])]
 )
 def test_half_of_the_evaluations_are_steps_and_at_most_three(count, factors):
-    np.testing.assert_allclose(radii(jnp.asarray(3.0), count), 3.0 * np.array(factors))
+    np.testing.assert_allclose(RADII(jnp.asarray(3.0), count), 3.0 * np.array(factors))
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_points_beside_a_step_lie_on_one_axis_after_the_other(x64, dtype):
-    step = jnp.array([3.0, 4.0], dtype)
-    steps = jnp.stack([step, 2 * step, step / 2])
+    step = np.array([3.0, 4.0], dtype)
+    steps = np.stack([step, 2 * step, step / 2])
     found = []
     for turn in (0, 7):
-        points, others = beside(steps, step, jnp.asarray(1, dtype), FREE, 7, ZERO + turn)
+        points, others = BESIDE(steps, step, jnp.asarray(1, dtype), FREE, 7, ZERO + turn)
         assert points.dtype == dtype
         assert others.tolist() == 3 * [False] + 4 * [True]
-        np.testing.assert_array_equal(points[:3], steps)
-        found += ((np.asarray(points[3:]) - np.asarray(step)) / 4).tolist()
+        np.testing.assert_array_equal(np.asarray(points)[:3], steps)
+        found += ((np.asarray(points)[3:] - step) / 4).tolist()
     axes = [[0, 1], [-1, 0], [0, -1], [1, 0]]
     np.testing.assert_allclose(found[:4], axes, atol=1e-6)
     assert len({tuple(np.round(one).tolist()) for one in found}) == 4
 
 
 def test_a_step_that_comes_twice_makes_way_for_a_point_beside_it():
-    step = jnp.array([3.0, 4.0])
-    steps = jnp.stack([step, step * (1 + 1e-5), step / 2])
-    points, others = beside(steps, step, jnp.asarray(9.0), FREE, 3, ZERO)
+    step = np.array([3.0, 4.0], np.float32)
+    steps = np.stack([step, step * (1 + 1e-5), step / 2])
+    points, others = BESIDE(steps, step, jnp.asarray(9.0), FREE, 3, ZERO)
     assert others.tolist() == [False, True, False]
-    assert float(jnp.linalg.norm(points[1] - step)) == pytest.approx(4)
+    assert np.linalg.norm(np.asarray(points)[1] - step) == pytest.approx(4)
 
 
 def test_beside_no_step_points_depend_on_the_radius():
-    points, _ = beside(jnp.zeros((1, 2)), jnp.zeros(2), jnp.asarray(0.5), FREE, 2, ZERO)
-    assert float(jnp.linalg.norm(points[1])) == pytest.approx(0.4)
+    step = np.zeros(2, np.float32)
+    points, _ = BESIDE(step[None], step, jnp.asarray(0.5), FREE, 2, ZERO)
+    assert np.linalg.norm(np.asarray(points)[1]) == pytest.approx(0.4)
 
 
 @pytest.mark.parametrize("step", [[-1.0], [1.0, 0.0], [0.0, -2.0]])
 @pytest.mark.parametrize("count", [2, 4])
 def test_points_beside_a_step_along_an_axis_are_new(step, count):
-    step = jnp.array(step)
-    factors = radii(ONE, count)
+    step = np.array(step, np.float32)
+    factors = np.asarray(RADII(ONE, count))
     for turn in range(0, 4 * count, count):
-        points, _ = beside(factors[:, None] * step[None], step, ONE, FREE, count, ZERO + turn)
+        points, _ = BESIDE(factors[:, None] * step[None], step, ONE, FREE, count, ZERO + turn)
         points = np.concatenate([np.zeros((1, len(step))), points])
         apart = np.linalg.norm(points[:, None] - points[None], axis=2) + np.eye(len(points))
         assert np.min(apart) > 0.15 * np.linalg.norm(step)
 
 
 def test_points_beside_a_step_are_within_the_bounds():
-    step, inside = jnp.array([0.0, 1.0]), lambda points: jnp.clip(points, -1, 1)
+    step, inside = np.array([0.0, 1.0], np.float32), lambda points: jnp.clip(points, -1, 1)
     for turn in range(0, 8, 2):
-        points, _ = beside(step[None], step, ONE, inside, 2, ZERO + turn)
-        assert jnp.max(jnp.abs(points)) <= 1
-        assert float(jnp.linalg.norm(points[1] - step)) == pytest.approx(0.8)
+        points, _ = BESIDE(step[None], step, ONE, inside, 2, ZERO + turn)
+        assert np.max(np.abs(points)) <= 1
+        assert np.linalg.norm(np.asarray(points)[1] - step) == pytest.approx(0.8)
 
 
 @pytest.mark.parametrize("count", quick_of([1, 2, 4, 8], [4]))

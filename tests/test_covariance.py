@@ -56,7 +56,7 @@ def fitted(model, data, y0=START, **settings) -> Any:
 def expected(model, result):
     """s^2 (J^T J)^-1, with JAX's Jacobian."""
     y, tree = ravel_pytree(result.y)
-    j = np.asarray(jax.jacobian(lambda y: model(tree(y)))(y), float)
+    j = np.asarray(jax.jit(jax.jacobian(lambda y: model(tree(y))))(y), float)
     return 2 * result.fun / (len(j) - len(y)) * np.linalg.inv(j.T @ j)
 
 

@@ -12,14 +12,19 @@ from smoothdiff._solvers._first_points import FirstPoints
 START = np.array([1.0, -2.0, 0.5])
 
 
+# compiled, as in a solver
+BEGIN = jax.jit(FirstPoints.start, static_argnums=1)
+NEXT, AFTER = jax.jit(FirstPoints.next, static_argnums=1), jax.jit(FirstPoints.after)
+
+
 def measured(losses, count=1):
     """All the first points, so many at once; `losses(reach)` has the start's, then each step's."""
-    first, evaluated = FirstPoints.start(jnp.zeros(3)), []
+    first, evaluated = BEGIN(jnp.zeros(3)), []
     while not bool(first.done()):
-        at, taken = (np.asarray(a) for a in first.next(count))
+        at, taken = (np.asarray(a) for a in NEXT(first, count))
         evaluated += at[taken].tolist()
         funs = np.asarray(losses(np.asarray(first.reach)))[at]
-        first = first.after(jnp.asarray(np.where(taken, funs, 0.0)), jnp.zeros(3, bool))
+        first = AFTER(first, jnp.asarray(np.where(taken, funs, 0.0)), np.zeros(3, bool))
     return np.asarray(first.reach), evaluated
 
 
@@ -52,23 +57,23 @@ def test_where_there_is_no_number_the_next_point_is_a_tenth_as_far(x64):
 
 
 def test_of_a_point_that_fails_the_other_side_comes_first(x64):
-    first, seen = FirstPoints.start(jnp.zeros(1)), []
+    first, seen = BEGIN(jnp.zeros(1)), []
     for fun in [1.0, *8 * [np.inf]]:
-        seen.append(float(jnp.where(first.turned, -1, 1)[0] * first.reach[0]))
-        first = first.after(jnp.array([fun]), jnp.ones(1, bool))
+        seen.append(np.where(first.turned, -1, 1).item() * first.reach.item())
+        first = AFTER(first, jnp.array([fun]), np.ones(1, bool))
     np.testing.assert_allclose(seen, [1, 1, 1, -1, -1, 0.1, 0.1, -0.1, -0.1], rtol=1e-6)
 
 
 def test_a_loss_that_is_high_on_the_other_side_is_tried_nearer_there_as_often():
     """And another search begins with the first side again."""
-    first, seen = FirstPoints.start(jnp.zeros(1)), []
+    first, seen = BEGIN(jnp.zeros(1)), []
     for fun in [1.0, np.inf, np.inf, *8 * [1e6]]:
         if first.done():
             break
-        seen.append(float(jnp.where(first.turned, -1, 1)[0] * first.reach[0]))
-        first = first.after(jnp.array([fun]), jnp.ones(1, bool))
+        seen.append(np.where(first.turned, -1, 1).item() * first.reach.item())
+        first = AFTER(first, jnp.array([fun]), np.ones(1, bool))
     np.testing.assert_allclose(seen, [1, 1, 1, -1, -1e-3, -1e-6, -1e-9], rtol=1e-5)
-    assert not first.around(jnp.ones(())).turned[0]
+    assert not jax.jit(FirstPoints.around)(first, jnp.ones(())).turned[0]
 
 
 @pytest.mark.parametrize("bounds", quick_of([None, (-2.0, 4.0)], [(-2.0, 4.0)]))
@@ -117,19 +122,21 @@ def test_calls_that_fail_by_chance_cost_no_more_than_themselves():
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_of_two_sides_those_that_fail_come_nearer_together(count):
-    first, sides = (
-        FirstPoints.start(jnp.zeros(2), 2),
-        jnp.kron(jnp.eye(2), jnp.array([[1.0], [-1]])),
-    )
+    sides = np.kron(np.eye(2), np.array([[1.0], [-1]])).astype(np.float32)
     others, seen = jnp.full((count, 2), 9.0), []
+
+    @jax.jit
+    def taken(first):
+        return first.points(sides, lambda: others, count), first.known(count)
 
     def all_of(first):
         while not first.done():
-            seen.extend(np.asarray(first.points(sides, lambda: others, count)).tolist())
-            first = first.known(count)
+            points, first = taken(first)
+            seen.extend(np.asarray(points).tolist())
         return first
 
-    first = all_of(all_of(first).again(jnp.array([False, True]), 0.1))
+    first = all_of(BEGIN(jnp.zeros(2), 2))
+    first = all_of(jax.jit(FirstPoints.again)(first, np.array([False, True]), 0.1))
     once, nearer = [[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], [[0, 1], [0, -1]]
     assert [point for point in seen if point != [9, 9]] == once + nearer
     assert len(seen) == -(-5 // count) * count + -(-2 // count) * count

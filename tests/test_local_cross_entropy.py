@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -84,12 +83,15 @@ def test_mean_and_spread_are_those_of_the_best_quarter(x64):
     matrix[:, 3] = 0  # a parameter that moves nothing: all are as good
     points, rows = rng.normal(size=(15, 4)), rng.normal(size=(15, 10))
     rows[2] = np.nan
-    blame = Blame.of(sd.matrix_support(matrix), lambda x: x, jnp.zeros(4))
-    batch = ResidualBatch.of(jnp.asarray(points), jnp.asarray(rows), jnp.asarray(15))
     middle = rng.normal(size=4)
-    (mean, spread, flat), (_, around, _) = (
-        eqx.filter_jit(_fit)(blame, batch, of) for of in (None, jnp.asarray(middle))
-    )
+
+    @jax.jit
+    def fits(points, rows, middle):
+        blame = Blame.of(sd.matrix_support(matrix), lambda x: x, jnp.zeros(4))
+        batch = ResidualBatch.of(points, rows, jnp.asarray(15))
+        return _fit(blame, batch, None), _fit(blame, batch, middle)
+
+    (mean, spread, flat), (_, around, _) = jax.tree.map(np.asarray, fits(points, rows, middle))
     np.testing.assert_array_equal(flat, [False, False, False, True])
     costs = (rows.reshape(15, 5, 2) ** 2).sum(axis=2) @ matrix
     for j in range(4):
@@ -103,7 +105,7 @@ def test_mean_and_spread_are_those_of_the_best_quarter(x64):
 
 def test_the_first_population_is_spread_evenly_over_the_bounds(key):
     params = take_apart(jnp.zeros(50), 1.0, (-1.0, 3.0))
-    points = np.asarray(_even(params, key, 16))
+    points = np.asarray(jax.jit(lambda key: _even(params, key, 16))(key))
     layers = np.sort(np.floor((points + 1) / 4 * 16), axis=0)
     np.testing.assert_array_equal(layers, np.arange(16)[:, None] * np.ones(50))
 

@@ -94,6 +94,15 @@ def test_a_step_is_good_if_it_led_down_or_may_have():
 
 # the metric
 
+METRIC = jax.jit(Metric.of, static_argnums=1)
+AND_BACK = jax.jit(lambda metric, x: (metric.into(metric.out(x)), metric.out(metric.into(x))))
+
+
+@jax.jit
+def adapted(metric, bends, noise):
+    """To a Hessian that is diagonal in units of the width."""
+    return metric.adapted(lambda v: bends * v, bends, jnp.asarray(noise, bends.dtype))
+
 
 def settled(hessian, metric):
     """The metric after many steps on one Hessian, without noise."""
@@ -111,56 +120,61 @@ def settled(hessian, metric):
 
 
 def test_widths_follow_the_hessian_to_its_inverse_root(x64):
-    hessian = jnp.asarray(symmetric(0, np.array([0.1, 1.0, 30.0]))[0])
-    metric = settled(hessian, Metric.of(jnp.array([0.5, 1.0, 2.0]), adapted=True))
-    round_ = metric.matrix.T @ hessian @ metric.matrix
+    hessian = symmetric(0, np.array([0.1, 1.0, 30.0]))[0]
+    metric = settled(hessian, METRIC(jnp.array([0.5, 1.0, 2.0]), True))
+    matrix = np.asarray(metric.matrix)
+    round_ = matrix.T @ hessian @ matrix
     np.testing.assert_allclose(round_ / round_[0, 0], np.eye(3), atol=1e-3)
-    assert jnp.linalg.det(metric.matrix) == pytest.approx(1)
-    points = jnp.asarray(np.random.default_rng(0).normal(size=(4, 3)))
-    np.testing.assert_allclose(metric.into(metric.out(points)), points, rtol=1e-9)
-    np.testing.assert_allclose(metric.out(metric.into(points[0])), points[0], rtol=1e-9)
+    assert np.linalg.det(matrix) == pytest.approx(1)
+    points = np.random.default_rng(0).normal(size=(4, 3))
+    for some in (points, points[0]):
+        np.testing.assert_allclose(AND_BACK(metric, some), 2 * [some], rtol=1e-9)
 
 
 def test_many_widths_follow_the_diagonal(x64):
-    sizes = jnp.asarray(np.geomspace(0.1, 10, MOST_DIRECTIONS + 1))
-    start = metric = turn = Metric.of(jnp.full(sizes.size, 0.5), adapted=True)
+    sizes = np.geomspace(0.1, 10, MOST_DIRECTIONS + 1)
+    metric = turn = METRIC(np.full(sizes.size, 0.5), True)
     assert metric.matrix.shape == sizes.shape
     for _ in range(60):
-        bends = sizes * metric.matrix**2
-        metric, turn = metric.adapted(lambda v, b=bends: b * v, bends, jnp.zeros(()))
-    np.testing.assert_allclose(metric.matrix * jnp.sqrt(sizes), 0.5, rtol=1e-3)
-    assert jnp.sum(jnp.log(metric.matrix / start.matrix)) == pytest.approx(0, abs=1e-9)
-    np.testing.assert_allclose(metric.into(metric.out(sizes)), sizes, rtol=1e-9)
-    np.testing.assert_allclose(turn.out(turn.into(sizes)), sizes, rtol=1e-9)
+        metric, turn = adapted(metric, sizes * np.asarray(metric.matrix) ** 2, 0.0)
+    np.testing.assert_allclose(np.asarray(metric.matrix) * np.sqrt(sizes), 0.5, rtol=1e-3)
+    assert np.sum(np.log(np.asarray(metric.matrix) / 0.5)) == pytest.approx(0, abs=1e-9)
+    for one in (metric, turn):
+        np.testing.assert_allclose(AND_BACK(one, sizes), 2 * [sizes], rtol=1e-9)
 
 
 @pytest.mark.parametrize(("size", "noise"), [(0.0, 0.0), (1.0, 1e6)], ids=["flat", "noise"])
 def test_what_says_nothing_changes_nothing(size, noise, x64):
-    bends = size * jnp.array([1.0, 5.0, -2.0])
-    metric = Metric.of(jnp.array([0.5, 1.0, 2.0]), adapted=True)
-    after, turn = metric.adapted(lambda v: bends * v, bends, jnp.asarray(noise))
+    metric = METRIC(jnp.array([0.5, 1.0, 2.0]), True)
+    after, turn = adapted(metric, size * np.array([1.0, 5.0, -2.0]), noise)
     np.testing.assert_allclose(after.matrix, metric.matrix, atol=1e-5)
     np.testing.assert_allclose(turn.matrix, np.eye(3), atol=1e-5)
 
 
 def test_points_stay_within_bounds_and_within_reach(dtype):
     rng = np.random.default_rng(0)
-    turn, moves = rng.normal(size=(3, 3)), jnp.asarray(3 * rng.normal(size=(200, 3)), dtype)
-    low, high = jnp.asarray([-1, -0.5, -2], dtype), jnp.asarray([0.1, 0.6, np.inf], dtype)
+    turn, moves = rng.normal(size=(3, 3)), (3 * rng.normal(size=(200, 3))).astype(dtype)
+    low, high = np.array([-1, -0.5, -2], dtype), np.array([0.1, 0.6, np.inf], dtype)
+
+    @functools.partial(jax.jit, static_argnums=2)
+    def bounded(metric, center, mirror):
+        """The points, their moves in units of the width, and those without bounds."""
+        place = functools.partial(metric.bounded, center, low=low, high=high, mirror=mirror)
+        points = jax.vmap(place)(moves)
+        return points, metric.into(points - center[None]), metric.out(moves)
+
     # the first center is inside, the second in a corner
-    for center in (jnp.zeros(3, dtype), jnp.asarray([0.1, -0.5, 0], dtype)):
+    for center in (np.zeros(3, dtype), np.array([0.1, -0.5, 0], dtype)):
         for matrix in (turn, turn * np.array([1, 1e-3, 1])):
             metric = Metric(*(jnp.asarray(a, dtype) for a in (matrix, np.linalg.inv(matrix))))
             for mirror in (False, True):
-                bounded = functools.partial(metric.bounded, low=low, high=high, mirror=mirror)
-                points = jax.vmap(bounded, in_axes=(None, 0))(center, moves)
-                assert np.all((points >= low[None]) & (points <= high[None]))
-                reach = jnp.linalg.norm(metric.into(points - center[None]), axis=1)
-                assert np.all(reach <= 1.101 * jnp.linalg.norm(moves, axis=1))
+                points, into, free = map(np.asarray, bounded(metric, center, mirror))
+                assert np.all((points >= low) & (points <= high))
+                reach = np.linalg.norm(into, axis=1)
+                assert np.all(reach <= 1.101 * np.linalg.norm(moves, axis=1))
                 # a step never turns round; of the samples in a narrow valley some do
-                turned = jnp.any((points - center[None]) * metric.out(moves) < -1e-6)
+                turned = np.any((points - center) * free < -1e-6)
                 assert mirror or not turned
-        plain = Metric.of(jnp.asarray([0.5, 1, 2], dtype), adapted=False)
-        place = jax.vmap(functools.partial(plain.bounded, center, low=low, high=high, mirror=True))
-        clamped = jnp.clip(center[None] + plain.out(moves), low[None], high[None])
-        np.testing.assert_array_equal(place(moves), clamped)
+        plain = METRIC(np.array([0.5, 1, 2], dtype), False)
+        points, _, free = map(np.asarray, bounded(plain, center, True))
+        np.testing.assert_array_equal(points, np.clip(center + free, low, high))

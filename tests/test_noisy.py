@@ -297,12 +297,12 @@ def test_samples_are_so_far_apart_that_they_differ_by_the_noise():
     random = np.random.default_rng(0)
     u, slopes = random.normal(size=(400, 3)), random.normal(size=(3, 6))
     noisy = u @ slopes + 2 * random.normal(size=(400, 6))
-    half = jnp.arange(400) < 200
-    many = jnp.asarray(np.where(np.arange(400)[:, None] < 200, noisy, 1e6), jnp.float32)
-    noise, signal = _noise_and_signal(jnp.asarray(u, jnp.float32), many, half)
+    half = np.arange(400) < 200
+    many = np.where(half[:, None], noisy, 1e6).astype(np.float32)
+    noise, signal = jax.jit(_noise_and_signal)(u.astype(np.float32), many, half)
     assert noise == pytest.approx(2 * np.sqrt(6), rel=0.1)
     assert signal == pytest.approx(np.linalg.norm(slopes), rel=0.1)
-    width = lambda *a: float(apart(*map(jnp.asarray, a)))
+    width = lambda *a: float(jax.jit(apart)(*map(jnp.asarray, a)))
     assert width(0.1, 2.0, 1.6) == pytest.approx(0.125)
     assert width(0.1, 2.0, 0.0) == pytest.approx(0.15)
     assert width(0.1, 0.0, 2.0) == pytest.approx(0.025)

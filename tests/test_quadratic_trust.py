@@ -24,13 +24,17 @@ def bowl(x):
     return 2.0 + (x - BEST) @ HESSIAN @ (x - BEST) / 2
 
 
-def known(points, fun=bowl):
-    """A history of the function at these points."""
-    points = jnp.asarray(np.asarray(points))
-    funs = jnp.asarray([fun(np.asarray(x)) for x in points])
+@jax.jit
+def filled(points, funs):
     empty = History.empty(40, N, 1, points.dtype)
     good, count = jnp.ones(len(points), bool), jnp.asarray(len(points))
     return empty.after(points, funs[:, None], funs, good, count)
+
+
+def known(points, fun=bowl):
+    """A history of the function at these points."""
+    points = np.asarray(points)
+    return filled(points, np.array([fun(x) for x in points], points.dtype))
 
 
 def around(count, width=1.0):
@@ -40,7 +44,8 @@ def around(count, width=1.0):
 
 
 # compiled, as in a solver
-REVISE = eqx.filter_jit(QuadraticTrust.revise)
+START, REVISE = eqx.filter_jit(QuadraticTrust.start), eqx.filter_jit(QuadraticTrust.revise)
+STEP = jax.jit(bounded_step)
 
 
 @eqx.filter_jit
@@ -52,7 +57,7 @@ def propose(trust, history, bounds=None, count=1):
 
 
 def proposal_of(history, radius=10.0, bounds=None, count=1):
-    trust = QuadraticTrust.start(jnp.ones(N), jnp.asarray(radius))
+    trust = START(jnp.ones(N), jnp.asarray(radius))
     proposal, center, fun = propose(trust, history, bounds, count)
     return trust, proposal, np.asarray(center), float(fun)
 
@@ -130,7 +135,7 @@ def test_it_is_stuck_after_five_failures_in_a_row_and_failed_without_a_radius(x6
     assert not trust.retried().stuck()
     assert trust.retried().radius == trust.radius
     assert not trust.revived(jnp.asarray(1.0)).stuck()
-    assert QuadraticTrust.start(jnp.ones(N), jnp.asarray(1e-16)).failed()
+    assert START(jnp.ones(N), jnp.asarray(1e-16)).failed()
 
 
 def test_where_the_model_is_flat_the_step_is_for_the_geometry(x64):
@@ -149,7 +154,7 @@ def test_a_check_is_where_the_model_knows_least(x64):
     plane = around(12, 0.3) @ (np.eye(N) - np.outer(normal, normal))
     history, high = known(plane), jnp.full(N, 0.2)
     for bounds in (None, (-9 * jnp.ones(N), high)):
-        trust = QuadraticTrust.start(jnp.ones(N), jnp.asarray(0.3))
+        trust = START(jnp.ones(N), jnp.asarray(0.3))
         trust = dataclasses.replace(trust, check=jnp.asarray(True))
         proposal, center, fun = propose(trust, history, bounds)
         step = np.asarray(proposal.points[0])
@@ -169,7 +174,7 @@ def test_a_check_is_where_the_model_knows_least(x64):
 
 def test_only_a_model_that_is_right_about_a_check_may_have_converged(x64):
     history = known([*around(10), BEST])
-    trust = QuadraticTrust.start(jnp.ones(N), jnp.asarray(0.3))
+    trust = START(jnp.ones(N), jnp.asarray(0.3))
     trust = dataclasses.replace(trust, check=jnp.asarray(True))
     proposal, _, fun = propose(trust, history)
     after = partial(of_check, trust, proposal, fun)
@@ -192,18 +197,16 @@ def test_a_shape_is_a_change_of_coordinates(x64, seed):
     hessian, grad, root = rng.normal(size=(N, N)), rng.normal(size=N), rng.normal(size=(N, N))
     hessian, root = hessian + hessian.T, root + 3 * np.eye(N)
     inverse = np.linalg.inv(root)
-    far, radius = jnp.full(N, 1e6), jnp.asarray(0.7)
-    turned = jnp.asarray(inverse @ hessian @ inverse.T), jnp.asarray(inverse @ grad)
-    round_ = bounded_step(turned[0], turned[1], radius, None, None)
-    given = jnp.asarray(hessian), jnp.asarray(grad), radius, -far, far, jnp.asarray(root @ root.T)
-    shaped = bounded_step(*given)
+    far, radius = np.full(N, 1e6), jnp.asarray(0.7)
+    round_ = STEP(inverse @ hessian @ inverse.T, inverse @ grad, radius, None, None)
+    shaped = STEP(hessian, grad, radius, -far, far, root @ root.T)
     np.testing.assert_allclose(root.T @ shaped, round_, rtol=1e-4, atol=1e-6)
 
 
 def test_it_works_in_float32_and_under_vmap():
     history = known(around(10).astype(np.float32))
     params = take_apart(jnp.zeros(N), jnp.ones(N), None)
-    center, _, fun = history.best(jnp.zeros(N))
+    center, _, fun = jax.jit(History.best)(history, np.zeros(N, np.float32))
 
     def step(radius):
         trust = QuadraticTrust.start(params.sigma, radius)

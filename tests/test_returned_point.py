@@ -283,14 +283,15 @@ def judge(fun, seen, new, old=()):
 
 
 def test_candidates_that_are_not_finite_lose_and_the_first_of_equals_wins():
-    points = jnp.array([[4.0, 1.0, 5.0], [1.0, -1.0, -1.0], [-1.0, -1.0, -1.0], [9.0, -9.0, 9.0]])
+    points = [[4, 1, 5], [1, -1, -1], [-1, -1, -1], [9, -9, 9]]
 
+    @jax.jit
     @jax.vmap
     def best(p):
         fun = lambda y: jnp.sqrt(y) // 1
         return judge(fun, (jnp.float32(9.5), jnp.float32(3)), [p[0], p[1]], [p[2]])
 
-    y, stats = best(points)
+    y, stats = best(np.array(points, np.float32))
     np.testing.assert_array_equal(y, [1, 1, 9.5, 9])
     np.testing.assert_array_equal(stats["fun"], [1, 1, 3, 3])
     np.testing.assert_array_equal(stats["evaluations"], 10 + 3 + 4)
@@ -299,12 +300,13 @@ def test_candidates_that_are_not_finite_lose_and_the_first_of_equals_wins():
 def test_what_rounding_does_is_no_noise_and_what_luck_did_is():
     fun = lambda y: (y - 2) ** 2 + 1
 
+    @jax.jit
     @jax.vmap
     def best(value):
         return judge(fun, (jnp.float32(1), value), [jnp.float32(0)], [jnp.float32(3)])
 
     close = np.float32(2) + np.spacing(np.float32(2)) * np.arange(-2, 3, dtype=np.float32)
-    y, stats = best(jnp.append(close, 0.5))
+    y, stats = best(np.append(close, np.float32(0.5)))
     assert stats["evaluations"].tolist() == [10 + 2 + 4] * 5 + [10 + judging(4, 1, 1)]
     assert judging(4, 1, 1) == 3 * 3 + 1 + 4
     # the other candidate was seen before, so that nothing was to be expected of it without noise

@@ -3,6 +3,7 @@
 import dataclasses
 from typing import cast
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ SIZES = Sizes(step=1, first=4, later=4, patience=60)
 RADIUS, WIDTH = 1e-3, 0.7
 
 
+@jax.jit
 def after_wide_samples(found, fun):
     """The search once the wide model's turn is over, in which it found this lowest point.
 
@@ -26,7 +28,7 @@ def after_wide_samples(found, fun):
     history = History.empty(40, N, 1, jnp.float32)
     for point, value in [(np.zeros(N), 1.0), (found, fun)]:
         row = jnp.full((1, 1), value)
-        new = jnp.asarray(point)[None], row, row[0], jnp.ones(1, bool)
+        new = jnp.asarray(point, jnp.float32)[None], row, row[0], jnp.ones(1, bool)
         history = history.after(*new, jnp.asarray(1))
     first = ValueSearch.of(PARAMS, jnp.zeros(N), jnp.asarray(WIDTH), history)
     search = cast(ValueSearch, first)

@@ -1,5 +1,7 @@
 """Where a search ends: at no minimum of a ripple, and soon after nothing is left but rounding."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -64,8 +66,9 @@ def test_a_search_at_a_minimum_makes_room_for_others(seed, x64):
 
 def test_rounding_alone_is_more_values_than_levels(dtype):
     eps = float(jnp.finfo(dtype).eps)
+    alone = jax.jit(rounding_alone)
     said = lambda funs, width: bool(
-        rounding_alone(jnp.asarray(funs, dtype), jnp.ones(len(funs), bool), jnp.asarray(width))
+        alone(np.asarray(funs, dtype), np.ones(len(funs), bool), jnp.asarray(width))
     )
     levels = 3 + 4 * eps * np.array([0, 1, 1, 0, 2])
     assert said(levels, 1e-6)
@@ -76,8 +79,8 @@ def test_rounding_alone_is_more_values_than_levels(dtype):
     assert not said(3 + 4 * eps * np.array([0, 9, 17, 40, 28]), 1e-6)
     # evaluations that failed say nothing
     for left in range(2):
-        some = jnp.arange(5) < left
-        assert not rounding_alone(jnp.asarray(levels, dtype), some, jnp.asarray(1e-6))
+        some = np.arange(5) < left
+        assert not alone(levels.astype(dtype), some, jnp.asarray(1e-6))
     # stairs of a hundredth are no rounding
     assert not said([3.0, 3.0, 3.01, 3.01, 3.0], 1e-6)
 
@@ -100,18 +103,17 @@ def test_samples_are_reflected_at_bounds(bounds):
     assert np.all((far >= bounds[0]) & (far <= bounds[1]))
 
 
+@functools.partial(jax.jit, static_argnums=0)
 def searched(dtype):
     """A search of three parameters that has evaluated its start, of value 1."""
     state = ResidualSearch.of(jnp.zeros(3, dtype), History.empty(20, 3, 1, dtype))
     return lowered(state, 1.0, 0)
 
 
+@jax.jit
 def lowered(search, value, count):
     points, rows, funs = (jnp.full(s, value, search.mark.dtype) for s in ((1, 3), (1, 1), (1,)))
-    return search.kept(History(points, rows, funs, ONE)).marked(count)
-
-
-ONE = jnp.ones(1, bool)
+    return search.kept(History(points, rows, funs, jnp.ones(1, bool))).marked(count)
 
 
 @pytest.mark.parametrize(("dtype", "little"), [(jnp.float32, 3e-6), (jnp.float64, 3e-9)])
