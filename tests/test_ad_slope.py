@@ -89,13 +89,20 @@ def test_what_is_linear_is_exact_for_value_gradient_and_hessian(key, x64):
     slope = jnp.arange(1.0, 41.0)
     f = lambda x: slope @ x + 1e6
     options = {"baseline": "ad", "num_samples": 4}
+
+    @jax.jit
+    def run(x):
+        smoothed = lambda x, sigma: sd.smooth(f, sigma, **options)(key, x)
+        grad = sd.smooth_grad(f, 0.3, **options)(key, x)
+        hvp = sd.smooth_hvp(f, 0.3, **options)(key, x, x)
+        return smoothed(x, 0.3), grad, hvp, jax.grad(smoothed, (0, 1))(x, 0.3)
+
     x = jnp.ones(40)
-    np.testing.assert_allclose(sd.smooth(f, 0.3, **options)(key, x), f(x), rtol=1e-15)
-    np.testing.assert_allclose(sd.smooth_grad(f, 0.3, **options)(key, x), slope, rtol=1e-8)
-    hvp = sd.smooth_hvp(f, 0.3, **options)(key, x, jnp.ones(40))
+    value, grad, hvp, by_ad = run(x)
+    np.testing.assert_allclose(value, f(x), rtol=1e-15)
+    np.testing.assert_allclose(grad, slope, rtol=1e-8)
     np.testing.assert_allclose(hvp, 0, atol=1e-5)
     # by AD of the smoothed function too, in sigma as well
-    by_ad = jax.grad(lambda x, sigma: sd.smooth(f, sigma, **options)(key, x), (0, 1))(x, 0.3)
     np.testing.assert_allclose(by_ad[0], slope, rtol=1e-8)
     np.testing.assert_allclose(by_ad[1], 0, atol=1e-5)
 

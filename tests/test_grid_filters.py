@@ -25,8 +25,8 @@ def compiled(name, ndim):
     return jax.jit(FILTERS[name](ndim))
 
 
-def random(*shape, dtype=jnp.float32, seed=0):
-    return jnp.asarray(np.random.default_rng(seed).normal(size=shape), dtype)
+def random(*shape, dtype=np.float32, seed=0):
+    return np.random.default_rng(seed).normal(size=shape).astype(dtype)
 
 
 def brute_force(signal, guide, sigma_d, levels, sigma_s):
@@ -50,7 +50,9 @@ def brute_force(signal, guide, sigma_d, levels, sigma_s):
 def matrix(filter, guide):
     """The filter of signals without channels as a dense matrix."""
     n = guide.size
-    rows = jax.jit(jax.vmap(filter, (0, None)))(jnp.eye(n).reshape(n, *guide.shape), guide)
+    rows = jax.jit(jax.vmap(filter, (0, None)))(
+        np.eye(n, dtype=guide.dtype).reshape(n, *guide.shape), guide
+    )
     return np.asarray(rows, np.float64).reshape(n, n).T
 
 
@@ -80,15 +82,15 @@ def test_cross_bilateral_is_equation_3(space, channels, dtype):
 
 def test_log_takes_the_logarithm_of_the_guide():
     signal, guide = random(6, 5), random(6, 5, seed=1)
-    found = cross_bilateral(0.5, 2, ndim=2, log=True)(signal, guide)
-    expected = cross_bilateral(0.5, 2, ndim=2)(signal, jnp.log(jnp.abs(guide)))
+    found = jax.jit(cross_bilateral(0.5, 2, ndim=2, log=True))(signal, guide)
+    expected = jax.jit(cross_bilateral(0.5, 2, ndim=2))(signal, np.log(np.abs(guide)))
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
 def test_bilateral_is_guided_by_the_signal():
     signal, guide = random(6, 5, 2), random(6, 5, 1, seed=1)
-    found = bilateral(0.5, 2, ndim=2)(signal, guide)
-    expected = cross_bilateral(0.5, 2, ndim=2, log=True)(signal, signal)
+    found = jax.jit(bilateral(0.5, 2, ndim=2))(signal, guide)
+    expected = jax.jit(cross_bilateral(0.5, 2, ndim=2, log=True))(signal, signal)
     np.testing.assert_array_equal(found, expected)
 
 
@@ -115,7 +117,7 @@ def test_eigenvalues_are_at_most_one(levels, space, sigma_d, x64):
 
 
 def test_eigenvalues_of_the_laplacian(x64):
-    dense = matrix(laplacian(19.0, ndim=2, power=2), jnp.zeros((5, 4)))
+    dense = matrix(laplacian(19.0, ndim=2, power=2), np.zeros((5, 4)))
     values = np.linalg.eigvalsh(dense)
     np.testing.assert_allclose(dense, dense.T, atol=1e-15)
     assert values.min() > 0
@@ -128,10 +130,10 @@ def test_no_data_scale_is_the_identity_where_the_guide_varies(sigma_d, dtype):
     filter = jax.jit(cross_bilateral(sigma_d, 3, ndim=2))
     found = filter(signal, guide)
     np.testing.assert_array_equal(found, signal)
-    half = jnp.where(jnp.arange(6)[:, None, None] < 3, 0, guide)  # filtered where it is constant
-    found = filter(signal, half)
+    half = np.where(np.arange(6)[:, None, None] < 3, 0, guide)  # filtered where it is constant
+    found = np.asarray(filter(signal, half))
     np.testing.assert_array_equal(found[3:], signal[3:])
-    in_space = cross_bilateral(jnp.inf, 3, ndim=2)(signal[:3], half[:3])
+    in_space = jax.jit(cross_bilateral(jnp.inf, 3, ndim=2))(signal[:3], half[:3])
     np.testing.assert_allclose(found[:3], in_space, rtol=1e-5)
 
 
@@ -146,7 +148,7 @@ def test_infinite_data_scale_is_the_spatial_filter(scale, dtype):
 @pytest.mark.parametrize("name", FILTERS)
 @pytest.mark.parametrize("value", [0.0, 1.0, -3.7e-20, 1e30, 3e38])
 def test_constants_are_preserved(name, value):
-    signal = jnp.full((6, 5, 2), value)
+    signal = np.full((6, 5, 2), value, np.float32)
     found = compiled(name, 2)(signal, random(6, 5, 2))
     np.testing.assert_allclose(found, signal, rtol=1e-6)
 
@@ -155,11 +157,11 @@ def test_constants_are_preserved(name, value):
 @pytest.mark.parametrize("space", [(9,), (4, 1, 6)])
 def test_finite_input_is_finite_output(name, space):
     filter = compiled(name, len(space))
-    signs, others = jnp.sign(random(*space, 2)), jnp.sign(random(*space, 3, seed=1))
+    signs, others = np.sign(random(*space, 2)), np.sign(random(*space, 3, seed=1))
     for signal_size, guide_size in itertools.product((0.0, 1e-40, 1.0, 3e38), repeat=2):
-        found = filter(signal_size * signs, guide_size * others)
-        assert jnp.all(jnp.isfinite(found))
-        assert jnp.all(jnp.abs(found) <= 1.00001 * signal_size)
+        found = np.asarray(filter(signal_size * signs, guide_size * others))
+        assert np.all(np.isfinite(found))
+        assert np.all(np.abs(found) <= 1.00001 * signal_size)
 
 
 @pytest.mark.parametrize("sigma_d", [0.0, 1e-38, 1e-3, 1e30, jnp.inf])
@@ -167,22 +169,22 @@ def test_finite_input_is_finite_output(name, space):
 def test_no_scale_gives_nan(sigma_d, log):
     filter = jax.jit(cross_bilateral(sigma_d, 2, ndim=1, log=log))
     for size in (0.0, 1e-40, 1.0, 3e38):
-        found = filter(random(9), size * jnp.sign(random(9, seed=1)))
-        assert jnp.all(jnp.isfinite(found))
+        found = filter(random(9), size * np.sign(random(9, seed=1)))
+        assert np.all(np.isfinite(found))
 
 
 def test_levels_set_the_reach():
-    spike = jnp.zeros(41).at[20].set(1.0)
+    spike, flat = np.float32(np.arange(41) == 20), np.zeros(41, np.float32)
     for levels in (1, 2, 4):
-        reached = jnp.flatnonzero(cross_bilateral(1.0, levels, ndim=1)(spike, jnp.zeros(41)))
+        reached = np.flatnonzero(jax.jit(cross_bilateral(1.0, levels, ndim=1))(spike, flat))
         assert reached.min() == 20 - (2**levels - 1)
         assert reached.max() == 20 + (2**levels - 1)
 
 
 def test_channels_are_alike_and_may_be_left_out():
     signal, guide = random(6, 5, 2, 3), random(6, 5, seed=1)
-    filter = cross_bilateral(0.5, 2, ndim=2)
-    found = filter(signal, guide)
+    filter = jax.jit(cross_bilateral(0.5, 2, ndim=2))
+    found = np.asarray(filter(signal, guide))
     assert found.shape == signal.shape
     for i, j in np.ndindex(2, 3):
         expected = filter(signal[..., i, j], guide[..., None])
@@ -192,10 +194,11 @@ def test_channels_are_alike_and_may_be_left_out():
 
 def test_axes_of_space_are_alike():
     signal, guide = random(4, 5, 6), random(4, 5, 6, seed=1)
-    filter = cross_bilateral(0.5, 2, ndim=3)
-    filter = jax.jit(filter)
+    filter = jax.jit(cross_bilateral(0.5, 2, ndim=3))
     found = filter(signal.transpose(2, 0, 1), guide.transpose(2, 0, 1))
-    np.testing.assert_allclose(found, filter(signal, guide).transpose(2, 0, 1), atol=1e-6)
+    np.testing.assert_allclose(
+        found, np.asarray(filter(signal, guide)).transpose(2, 0, 1), atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("name", FILTERS)
@@ -214,7 +217,7 @@ def test_derivatives_of_cross_bilateral(channels, x64):
 
     signal = random(5, 2, dtype=jnp.float64)
     guide = random(5, channels, dtype=jnp.float64, seed=1)
-    arrays = jnp.array(0.5), jnp.array(1.0), signal, guide
+    arrays = np.float64(0.5), np.float64(1.0), signal, guide
     check_grads(jax.jit(filter), arrays, order=1, modes=["rev"])
 
 
@@ -224,10 +227,10 @@ def test_derivatives_in_float32_are_those_in_float64():
     def derivatives(sigma_d, signal, guide):
         return jnp.sum(cross_bilateral(sigma_d, 2, ndim=1)(signal, guide) ** 2)
 
-    single = derivatives(jnp.float32(0.5), random(6, 2), random(6, 3, seed=1))
+    single = derivatives(np.float32(0.5), random(6, 2), random(6, 3, seed=1))
     with jax.enable_x64(True):
         arrays = random(6, 2, dtype=jnp.float64), random(6, 3, dtype=jnp.float64, seed=1)
-        double = derivatives(jnp.float64(0.5), *arrays)
+        double = derivatives(np.float64(0.5), *arrays)
     for found, expected in zip(single, double, strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
@@ -241,8 +244,8 @@ def test_derivatives_are_finite(channels):
 
     for size in (0.0, 1.0, 1e30):
         guide = size * random(6, channels, seed=1)
-        for derivative in derivatives(jnp.float32(0.5), random(6, 2), guide):
-            assert jnp.all(jnp.isfinite(derivative))
+        for derivative in derivatives(np.float32(0.5), random(6, 2), guide):
+            assert np.all(np.isfinite(derivative))
 
 
 def test_derivatives_of_the_laplacian(x64):
@@ -255,9 +258,10 @@ def test_derivatives_of_the_laplacian(x64):
 
 def test_a_signal_may_be_narrower_than_its_guide(x64):
     signal, guide = random(6, 5), random(6, 5, dtype=jnp.float64, seed=1)
-    found = cross_bilateral(0.5, 2, ndim=2)(signal, guide)
+    filter = jax.jit(cross_bilateral(0.5, 2, ndim=2))
+    found = filter(signal, guide)
     assert found.dtype == jnp.float32
-    expected = cross_bilateral(0.5, 2, ndim=2)(signal, guide.astype(jnp.float32))
+    expected = filter(signal, guide.astype(np.float32))
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
@@ -294,7 +298,7 @@ def test_traced_scales_that_are_invalid_give_nan(scales):
     def filter(sigma_d, sigma_s):
         return cross_bilateral(sigma_d, 1, ndim=1, sigma_s=sigma_s)(jnp.ones(3), jnp.ones(3))
 
-    assert jnp.all(jnp.isnan(jax.jit(filter)(*map(jnp.float32, scales))))
+    assert np.all(np.isnan(jax.jit(filter)(*map(np.float32, scales))))
 
 
 def test_memory_grows_with_the_signal_only():

@@ -72,11 +72,11 @@ def test_the_trajectory_is_that_of_the_reparameterised_form(b1, b2, x64):
 
 def test_without_smoothing_and_memory_it_is_gradient_descent_of_unit_length(dtype):
     x, target = jnp.asarray(POSITIONS, dtype), jnp.asarray(TARGET, dtype)
-    gradient = jax.grad(loss)(x, target)
+    gradient = np.asarray(jax.jit(jax.grad(loss))(x, target))
     optimiser = large_steps(0.1, FACES, 0.0, 0.0, 0.0)
     updates = first_updates(optimiser, gradient, x)
     assert updates.dtype == dtype
-    expected = -0.1 * gradient / jnp.max(jnp.abs(gradient))
+    expected = -0.1 * gradient / np.max(np.abs(gradient))
     np.testing.assert_allclose(updates, expected, rtol=1e-5, atol=1e-8)
 
 
@@ -88,18 +88,18 @@ def test_without_decay_nothing_is_kept():
 def test_it_comes_closer_than_the_bare_gradient_for_its_length():
     """The point of it: no bump of a single vertex, although its gradient is one."""
     x = jnp.asarray(POSITIONS, jnp.float32)
-    spike = jnp.zeros_like(x).at[0].set(1.0)
+    spike = np.zeros_like(x)
+    spike[0] = 1
     optimiser = large_steps(0.1, FACES, LAM)
-    updates = first_updates(optimiser, spike, x)
-    others = jnp.linalg.norm(updates[1:], axis=1)
-    assert jnp.max(others) > 0.5 * jnp.linalg.norm(updates[0])
+    updates = np.asarray(first_updates(optimiser, spike, x))
+    others = np.linalg.norm(updates[1:], axis=1)
+    assert np.max(others) > 0.5 * np.linalg.norm(updates[0])
 
 
 def test_a_zero_gradient_moves_nothing():
     x = jnp.asarray(POSITIONS, jnp.float32)
     optimiser = large_steps(0.1, FACES, LAM)
-    updates, _ = optimiser.update(jnp.zeros_like(x), optimiser.init(x), x)
-    np.testing.assert_array_equal(updates, 0)
+    np.testing.assert_array_equal(first_updates(optimiser, np.zeros_like(x), x), 0)
 
 
 def test_schedules_masks_and_labels(x64):

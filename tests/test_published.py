@@ -37,7 +37,7 @@ def bowl() -> Flat:
 
 def test_conjugate_steps_find_the_minimum_of_a_quadratic_in_as_many_steps_as_dimensions():
     flat, x = bowl(), START
-    gradient = jax.grad(flat.loss)
+    gradient = jax.jit(jax.grad(flat.loss))
     r = v = -gradient(x)
     for _ in range(2):
         x, _ = _move(flat, x, v, gradient(x), MATRIX @ v, 100.0)
@@ -76,7 +76,8 @@ def test_slopes_are_those_of_the_smoothed_loss(case, key):
     slope, pairs = case
     flat = bowl()
     one = higher_order.SLOPES[slope](flat, pairs)
-    found = jax.vmap(lambda key: one(key, jnp.float32(0.3), START))(jax.random.split(key, 4000))
+    many = jax.jit(jax.vmap(lambda key: one(key, jnp.float32(0.3), START)))
+    found = np.asarray(many(jax.random.split(key, 4000)))
     error = np.std(found, 0) / np.sqrt(len(found))
     true = MATRIX @ (np.asarray(START) - SOUGHT)  # smoothing does not change a quadratic's slope
     assert np.all(np.abs(np.mean(found, 0) - true) < 4 * error)
@@ -85,7 +86,8 @@ def test_slopes_are_those_of_the_smoothed_loss(case, key):
 def test_a_derivative_without_pairs_takes_its_share_of_the_others(key):
     """With one pair in two dimensions: half of the time its own, else half of the other's."""
     one = _pairs.aggregate(bowl(), 1)
-    found = jax.vmap(lambda key: one(key, jnp.float32(0.3), START))(jax.random.split(key, 20_000))
+    many = jax.jit(jax.vmap(lambda key: one(key, jnp.float32(0.3), START)))
+    found = np.asarray(many(jax.random.split(key, 20_000)))
     true = MATRIX @ (np.asarray(START) - SOUGHT)
     assert np.mean(found, 0) == pytest.approx(0.75 * true, rel=0.15)
 
@@ -95,9 +97,8 @@ def test_fischers_slope_sees_all_parameters_at_once(key):
     line = lambda y: 3 * y[0] - 2 * y[1]
     box = np.full(2, -20, np.float32), np.full(2, 20, np.float32)
     one = _pairs.fischer(Flat(Problem(box, 1.0, Budget(10, 60), line)), 1)
-    found = jax.vmap(lambda key: one(key, jnp.float32(0.5), jnp.zeros(2)))(
-        jax.random.split(key, 4000)
-    )
+    many = jax.jit(jax.vmap(lambda key: one(key, jnp.float32(0.5), jnp.zeros(2))))
+    found = np.asarray(many(jax.random.split(key, 4000)))
     assert np.mean(found, 0) == pytest.approx([3, -2], rel=0.1)
 
 
@@ -142,13 +143,14 @@ def test_settings_are_in_units_of_the_first_sigma():
 
 def test_starts_are_where_the_authors_have_them():
     quad, box2, box10 = (TASKS[name]() for name in ("quad", "box2", "box10"))
+    loss = jax.jit(box2.problem.loss)
     for seed in range(5):
         y = np.asarray(quad.start(seed))
         assert np.all((y >= 800) & (y <= 1000))
         # on a plateau: the square does not touch the one that is sought
-        y = box2.start(seed)
-        moved = box2.problem.loss(y + jnp.array([2.0, -2.0]))
-        assert box2.problem.loss(y) == pytest.approx(float(moved), rel=1e-2)
+        y = np.asarray(box2.start(seed))
+        moved = loss(y + np.float32([2, -2]))
+        assert loss(y) == pytest.approx(float(moved), rel=1e-2)
         assert np.all(np.abs(np.asarray(box10.start(seed)) - 250) < 60)
     for task in (quad, box2, box10):
         assert task.problem.loss(jnp.asarray(task.score.reference)) == 0

@@ -183,9 +183,10 @@ def test_a_black_box_that_breaks_loses_nothing(tmp_path):
 
 
 def test_new_parameters_are_spread_like_those_found(key):
-    scale = jnp.array([1.0, 20.0, 0.0])
-    found = scale[None] * jax.random.uniform(key, (256, 3)) + 5
-    new = like(jax.random.key(1), found, (40, 50)).reshape(-1, 3)
+    scale = np.array([1.0, 20.0, 0.0], np.float32)
+    found = scale * np.asarray(jax.random.uniform(key, (256, 3))) + 5
+    draw = jax.jit(lambda key, found: like(key, found, (40, 50)))
+    new = np.asarray(draw(jax.random.key(1), found)).reshape(-1, 3)
     assert (new >= found.min(0)[None]).all()
     assert (new <= found.max(0)[None]).all()
     np.testing.assert_allclose(new.std(0), found.std(0), rtol=0.15)
@@ -194,14 +195,18 @@ def test_new_parameters_are_spread_like_those_found(key):
 
 
 def test_the_last_renders_are_kept_and_those_within_the_range_count():
-    first = Rendered(jnp.full((3, 1), jnp.nan), jnp.full((3, 2), jnp.nan))
-    rendered = first.after(jnp.array([[1.0], [5.0]]), jnp.ones((2, 2)))
-    rendered = rendered.after(jnp.array([[2.0]]), jnp.array([[1.0, jnp.nan]]))
-    np.testing.assert_array_equal(rendered.points[:, 0], [1.0, 5.0, 2.0])
-    best = jnp.array([[0.0], [3.0]])
-    np.testing.assert_array_equal(rendered.within(best), [True, False, False])
-    more = rendered.after(jnp.arange(5.0)[:, None], jnp.ones((5, 2)))
-    np.testing.assert_array_equal(more.points[:, 0], [2.0, 3.0, 4.0])
+    @jax.jit
+    def run():
+        first = Rendered(jnp.full((3, 1), jnp.nan), jnp.full((3, 2), jnp.nan))
+        rendered = first.after(jnp.array([[1.0], [5.0]]), jnp.ones((2, 2)))
+        rendered = rendered.after(jnp.array([[2.0]]), jnp.array([[1.0, jnp.nan]]))
+        within = rendered.within(jnp.array([[0.0], [3.0]]))
+        return rendered, within, rendered.after(jnp.arange(5.0)[:, None], jnp.ones((5, 2)))
+
+    rendered, within, more = run()
+    np.testing.assert_array_equal(np.ravel(rendered.points), [1.0, 5.0, 2.0])
+    np.testing.assert_array_equal(within, [True, False, False])
+    np.testing.assert_array_equal(np.ravel(more.points), [2.0, 3.0, 4.0])
 
 
 @pytest.mark.parametrize(("planned", "each"), [(1, 8), (2, 100), (25, 128)])
