@@ -104,6 +104,12 @@ def test_power_is_applying_it_again(body, x64):
     assert_same(*both(noise(positions)), jnp.float64)
 
 
+def test_a_signal_may_be_numpys():
+    positions, faces = MESHES["triangle"]
+    smooth, signal = mesh_laplacian(faces, LAM), noise(positions).astype(np.float32)
+    np.testing.assert_array_equal(smooth(signal, None), smooth(jnp.asarray(signal), None))
+
+
 def test_it_is_accurate_on_a_mesh_of_many_parts(key):
     positions, faces = icosphere(4)
     smooth = jax.jit(mesh_laplacian(faces, LAM))

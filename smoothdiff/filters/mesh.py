@@ -84,7 +84,7 @@ def mesh_laplacian(
     def filter(signal: Array, guide: Any) -> Array:
         _check_signal(signal, faces)
         for _ in range(power):
-            signal = solve(signal, guide)
+            signal = solve(jnp.asarray(signal), guide)
         return signal
 
     return filter
