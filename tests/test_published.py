@@ -149,7 +149,7 @@ def test_starts_are_where_the_authors_have_them():
         assert np.all((y >= 800) & (y <= 1000))
         # on a plateau: the square does not touch the one that is sought
         y = np.asarray(box2.start(seed))
-        moved = loss(y + np.float32([2, -2]))
+        moved = loss(y + np.array([2, -2], np.float32))
         assert loss(y) == pytest.approx(float(moved), rel=1e-2)
         assert np.all(np.abs(np.asarray(box10.start(seed)) - 250) < 60)
     for task in (quad, box2, box10):

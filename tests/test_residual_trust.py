@@ -1,5 +1,7 @@
 """The local model of residuals: its step within a region, its fit, what it makes of an outcome."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,6 +16,7 @@ from smoothdiff._solvers._residual_trust import Proposal, TrustRegion
 
 STEP = jax.jit(bounded_step)
 NONE = None, None
+ONES: Any = np.ones(3)
 
 
 def quadratic(seed, n=4, shift=0.0):
@@ -97,7 +100,7 @@ def known(points, rows=None):
 
 def propose(trust, history):
     center, row, _ = BEST(history, np.zeros(3))
-    proposal = PROPOSE(trust, history, center, row, np.ones(3), NONE, 1, jnp.asarray(0, jnp.int32))
+    proposal = PROPOSE(trust, history, center, row, ONES, NONE, 1, jnp.asarray(0, jnp.int32))
     return proposal, center, row
 
 
@@ -176,12 +179,12 @@ def test_a_step_that_comes_to_nothing_in_rounding_is_no_failure_after_steps_that
 )
 def test_a_step_is_lost_within_a_few_roundings_of_the_parameters(length, center, radius, lost, x64):
     away = np.concatenate([np.zeros((1, 3)), np.eye(3)])
-    middle = np.full(3, center)
+    middle: Any = np.full(3, center)
     rows = (away + length * np.eye(3)[:1]) @ JACOBIAN
     history = known(center + away, rows)
     at = jnp.asarray(0, jnp.int32)
     trust = START(jnp.asarray(radius), 3, 7)
-    proposal = PROPOSE(trust, history, middle, rows[0], np.ones(3), NONE, 1, at)
+    proposal = PROPOSE(trust, history, middle, rows[0], ONES, NONE, 1, at)
     assert float(proposal.points[0, 0]) == pytest.approx(-min(length, radius), rel=1e-3)
     assert bool(proposal.lost[0]) == lost
 
@@ -246,12 +249,17 @@ def test_a_step_that_was_far_too_long_says_nothing_against_the_model():
 def test_the_best_point_stays_in_the_history(x64):
     history = known([[0.0, 0, 0]])
     best = np.array([[0.5, 0.5, 0.5]])
-    after, followed_by = jax.jit(History.after), jax.jit(History.followed_by, static_argnums=2)
-    history = after(history, best, np.zeros((1, 7)), np.zeros(1), np.ones(1, bool), 1)
+    history = jax.jit(History.after)(
+        history, best, np.zeros((1, 7)), np.zeros(1), np.ones(1, bool), 1
+    )
+
+    @jax.jit
+    def followed(history, point, rows):
+        new = History(point, rows, jnp.sum(rows**2, axis=1) / 2, jnp.ones(1, bool))
+        return history.followed_by(new, True)
+
     for i in range(40):
-        point, rows = np.full((1, 3), float(i)), np.full((1, 7), 1.0 + i)
-        new = History(point, rows, np.sum(rows**2, axis=1) / 2, np.ones(1, bool))
-        history = followed_by(history, new, True)
+        history = followed(history, np.full((1, 3), float(i)), np.full((1, 7), 1.0 + i))
     point, row, _ = BEST(history, np.zeros(3))
     np.testing.assert_array_equal(point, best[0])
     np.testing.assert_array_equal(row, np.zeros(7))
