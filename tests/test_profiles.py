@@ -11,7 +11,7 @@ from jax.core import Tracer
 from benchmarks import _study
 from benchmarks._task import NotAble, precision
 from benchmarks.studies import profiles
-from benchmarks.studies.profiles import kinds, ours, peers
+from benchmarks.studies.profiles import kept, kinds, ours, peers
 from benchmarks.studies.profiles.problems import Case, Panel
 from benchmarks.studies.profiles.runs import Method, Seen, Spent, trace
 from benchmarks.studies.profiles.shares import PAIRS, profile
@@ -117,13 +117,12 @@ QUICK = {
     "fresh": False,
     "methods": None,
     "names": [],
-    "seeds": None,
     "jobs": 1,
     "said": "",
 }
 
 
-def toy(full, seeds):
+def toy(full):
     yield Panel("scalars", "Bowls", [bowl(1, name="one"), bowl(2, name="two")], (10, 40))
     yield Panel("residuals", "Equations", [equations()], (10,))
 
@@ -177,7 +176,8 @@ def test_processes_that_share_the_runs_make_each_once(tmp_path, monkeypatch):
     methods = {"nelder_mead": simplex._replace(search=counted)}
     monkeypatch.setattr(profiles, "METHODS", methods)
     monkeypatch.setattr(profiles, "SETS", {"toy": toy})
-    monkeypatch.setattr(profiles, "ProcessPoolExecutor", Thread)
+    monkeypatch.setattr(kept, "SETS", {"toy": toy})
+    monkeypatch.setattr(kept, "ProcessPoolExecutor", Thread)
     alone = profiles.measure(Namespace(**QUICK), tmp_path / "alone")
     shared = Namespace(**{**QUICK, "jobs": 2, "fresh": True})
     assert profiles.measure(shared, tmp_path) == alone

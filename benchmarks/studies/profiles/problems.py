@@ -62,7 +62,7 @@ class Panel(NamedTuple):
         return budget * (case.start.size + self.more)
 
 
-def residuals(full: bool, _: int | None = None) -> Iterator[Panel]:
+def residuals(full: bool) -> Iterator[Panel]:
     """Least squares: up to 20 parameters and 500 residuals, no fewer than parameters."""
     cases, budgets = _with_residuals(full), (5, 10, 20, 30) if full else (5, 10, 20)
     for kind in RESIDUALS:
@@ -70,7 +70,7 @@ def residuals(full: bool, _: int | None = None) -> Iterator[Panel]:
         yield Panel("residuals", f"Residuals, {kind.title}", seen, budgets)
 
 
-def scalars(full: bool, _: int | None = None) -> Iterator[Panel]:
+def scalars(full: bool) -> Iterator[Panel]:
     """Numbers: up to 50 parameters; and sums of absolute residuals, which have kinks."""
     cases, budgets = _numbers(full), (10, 50, 200, 500) if full else (10, 30, 100)
     for kind in SCALARS:
@@ -80,19 +80,18 @@ def scalars(full: bool, _: int | None = None) -> Iterator[Panel]:
     yield Panel("scalars", "Scalars, sums of absolute values", kinks, budgets)
 
 
-def bbob(n: int, full: bool, instances: int | None) -> Iterator[Panel]:
+def bbob(n: int, full: bool) -> Iterator[Panel]:
     """Each start is drawn within the box. The quick setting has six functions in 5-D."""
     if n > 5 and not full:
         return
     cocoex = package("cocoex", "coco-experiment")
-    numbers, usual = (range(1, 25), 3) if full else ((1, 6, 8, 10, 15, 21), 1)
-    drawn = range(1, 1 + (instances or usual))
-    cases = [_bbob(cocoex, f, n, instance) for f, instance in product(numbers, drawn)]
+    numbers, instances = (range(1, 25), (1, 2, 3)) if full else ((1, 6, 8, 10, 15, 21), (1,))
+    cases = [_bbob(cocoex, f, n, instance) for f, instance in product(numbers, instances)]
     budgets = (10, 30, 100, 300, 1000) if full else (10, 100)
     yield Panel("bbob", f"BBOB, {n}-D", cases, budgets, more=0, targets=TARGETS)
 
 
-def large(n: int, full: bool, _: int | None = None) -> Iterator[Panel]:
+def large(n: int, full: bool) -> Iterator[Panel]:
     """The 24 functions of COCO's large-scale suite, whose rotations are cheap."""
     if not full:
         return

@@ -22,7 +22,8 @@ from benchmarks._grid import Grid, Row, short
 from benchmarks._names import name_of
 from benchmarks._summary import cost_to_level
 from benchmarks._task import NotAble, precision
-from benchmarks.studies.profiles import METHODS, behaviour_of, chosen
+from benchmarks.studies.profiles import METHODS, chosen
+from benchmarks.studies.profiles.kept import behaviour_of
 from benchmarks.studies.profiles.problems import Case
 from benchmarks.studies.profiles.runs import Method, trace
 from benchmarks.studies.simulators.programs import SIMULATORS, Simulator
