@@ -28,6 +28,7 @@ from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._model_check import check_step, is_right
 from smoothdiff._solvers._point_search import nothing
 from smoothdiff._solvers._ratio_test import (
+    FEW,
     INSIDE,
     TELLING,
     asks_nothing,
@@ -220,7 +221,8 @@ class QuadraticTrust(eqx.Module):
         best = jnp.argmin(funs)
         # what rounding may do says nothing against the model
         fun, promise = funs[best], proposal.reduction[best]
-        little = proposal.lost | ~(promise > jnp.finfo(fun.dtype).eps * jnp.abs(before))
+        unit = jnp.finfo(fun.dtype).eps * jnp.abs(before)
+        little = proposal.lost | ~(promise > unit)
         reduction = jnp.where(little, 0, promise)
         hessian = proposal.hessian
         metric, turn = self.metric.adapted(
@@ -244,12 +246,12 @@ class QuadraticTrust(eqx.Module):
         wait = proposal.poor & patient & ~long
         fails = jnp.where(wait, jnp.minimum(fails, _PATIENCE), fails)
         lower = jnp.minimum(self.radius, length) * jnp.where(long, 0.1, 0.5)
-        # nor does a failure that rounding may explain, near a minimum
-        blamed = failed & ~wait & (outcome.more | ~self.settled)
-        radius = jnp.where(blamed, lower, self.radius)
+        # near a minimum rounding may explain a failure, and a check needs the radius to tell
+        explained = self.settled & ~(promise > FEW[fun.dtype.name] * unit)
+        radius = jnp.where(failed & ~wait & ~explained, lower, self.radius)
         radius = jnp.where(held, jnp.maximum(radius, 2 * length), radius)
         # where a check rose by more than rounding, the radius is not too small to tell
-        tells = funs[0] - before > TELLING * jnp.finfo(fun.dtype).eps * jnp.abs(before)
+        tells = funs[0] - before > TELLING * unit
         tight = proposal.tight & ~self.teaches() & ~(proposal.check & tells)
         radius = jnp.where(tight, 2 * self.radius, radius)
         ends = settled(self.settled | proposal.lost, outcome, moved, tried[best])

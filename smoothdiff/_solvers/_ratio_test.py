@@ -13,10 +13,10 @@ _FAR_OFF = 10.0
 INSIDE = 0.95
 # a reduction of so many roundings of the value is nothing, a rise of so many is one for sure
 _NOTHING, TELLING = 8, 1000
-# a step of so many roundings of the parameters may be lost in those of the function's own sums; in
-# float32 that would be too long a step to do without
-_LOST = {"float32": 8, "float64": 64}
-# a parameter's range in sigmas, where it is not known: those of the default sigma
+# what moves the parameters or the value by so few roundings may be lost in those of the function's
+# own sums; in float32 more of them would be too much to do without
+FEW = {"float32": 8, "float64": 64}
+# a parameter's range in sigmas, by the default sigma
 _RANGE = 5
 # a reduction of a smaller share of the value is no progress, nor one of few roundings
 _PROGRESS = 1e-8
@@ -88,10 +88,15 @@ def lost_in_rounding(
 ) -> Bool[Array, ""]:
     """Whether a step moves parameters by so few roundings that what it promises may be lost.
 
-    Of a parameter near zero they are those of its range: its own would be too short to tell, where
-    it is in one sum with others.
+    A parameter near zero has the roundings of its range: its own are shorter than those of a sum
+    with others.
+
+    Args:
+        move: the step, in the units of the parameters.
+        center: where it begins.
+        sigma: that of each parameter, a fifth of its range.
     """
-    roundings = _LOST[move.dtype.name] * jnp.finfo(move.dtype).eps
+    roundings = FEW[move.dtype.name] * jnp.finfo(move.dtype).eps
     return jnp.all(jnp.abs(move) <= roundings * jnp.maximum(jnp.abs(center), _RANGE * sigma))
 
 
