@@ -22,8 +22,8 @@ class Flat:
     def of(tree: PyTree) -> "Flat":
         """Of any pytree, whose other leaves are hashable."""
         leaves, treedef = jax.tree.flatten(tree)
-        arrays = tuple(leaf if eqx.is_array(leaf) else None for leaf in leaves)
-        others = tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)
+        pairs = [(leaf, None) if eqx.is_array(leaf) else (None, leaf) for leaf in leaves]
+        arrays, others = zip(*pairs, strict=True) if pairs else ((), ())
         return Flat(arrays, (treedef, others))
 
     def tree(self) -> PyTree:

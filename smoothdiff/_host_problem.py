@@ -2,29 +2,31 @@
 
 import contextlib
 import dataclasses
+import functools
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from smoothdiff._call_checks import check_squares
 from smoothdiff._devices import brought, is_moved, on_cpu, where_committed
+from smoothdiff._flat import Flat
 from smoothdiff._host_function import evaluator, rows_at, traced
 from smoothdiff._host_steps import HostSteps
 from smoothdiff._known import Known
+from smoothdiff._layout import Layout, layout_of
 from smoothdiff._problem import Problem, Trial
-from smoothdiff._programs import is_short
-from smoothdiff._solvers._evaluator import Evaluator
-from smoothdiff._solvers._judgement import Values, differ
-from smoothdiff._solvers._point_by_point import PointState, PointStep
+from smoothdiff._programs import is_short, jit_quickly
+from smoothdiff._solvers._evaluator import Evaluator, objectives
+from smoothdiff._solvers._judgement import differ
+from smoothdiff._solvers._point_by_point import PointState
 from smoothdiff._solvers._random_numbers import in_round, takes_key
 
 
+@dataclasses.dataclass(frozen=True)
 class HostProblem(Problem):
     """A problem whose solver steps point by point.
 
@@ -32,10 +34,11 @@ class HostProblem(Problem):
     """
 
     host: HostSteps
+    layout: Layout
     known: Known | None
-    device: Any = eqx.field(static=True)
-    moved: bool = eqx.field(static=True)
-    quick: bool = eqx.field(static=True, default=False)
+    device: Any
+    moved: bool
+    quick: bool = False
 
     @staticmethod
     def of(
@@ -52,7 +55,7 @@ class HostProblem(Problem):
         with on_cpu() if moved else contextlib.nullcontext():
             ours = brought((solver, options, y)) if moved else (solver, options, y)
             host = HostSteps.of(*ours)
-        return HostProblem(fun, solver, args, options, host, known, device, moved)
+        return HostProblem(fun, solver, args, options, host, layout_of(y), known, device, moved)
 
     def place(self) -> contextlib.AbstractContextManager:
         """A CPU, if the steps are moved."""
@@ -78,22 +81,26 @@ class HostProblem(Problem):
     def step(self, y: PyTree, state: PointState) -> tuple[PyTree, PointState, Bool[Array, ""]]:
         """The next evaluations, between what is compiled for the stage of the search."""
         points, proposal = self.host.propose(y, state)
-        args = self.args
+        evaluate = self._evaluate
         if takes_key(self.options):
-            args = self.host.parts(y, state).numbers(args)
-        before = self._answered()
-        rows = self._rows(_evaluator(self, args, y), points, len(points))
-        if self.solver.squares and state.progress.step == 0:
-            check_squares(np.asarray(rows[0]))
+            numbers = self.host.parts(y, state).numbers(self.args)
+            evaluate = Flat.of(dataclasses.replace(self._evaluator, args=numbers))
+        before = 0 if self.known is None else self.known.answered
+        rows = self._rows(evaluate, points, len(points))
+        if self.solver.squares and int(state.progress.step) == 0:
+            check_squares(np.asarray(rows)[0])
         y, state, over = self.host.told(y, state, points, rows, proposal)
-        if (answered := self._answered() - before) > 0:
+        if self.known is None:
+            return y, state, over
+        if (answered := self.known.answered - before) > 0:
             count = state.progress.evaluations - answered
             state = eqx.tree_at(lambda s: s.progress.evaluations, state, count)
-        return y, state, over | self._exhausted()
+        return y, state, over | self.known.exhausted
 
     def done(self, y: PyTree, state: PointState) -> Bool[Array, ""]:
         """Whether the solver wants to stop before a step, compiled for shapes."""
-        return _done(self.host.parts(y, state)) | self._exhausted()
+        over = self.host.over(y, state)
+        return over if self.known is None else over | self.known.exhausted
 
     def reason(self, state: PointState) -> str:
         """As the solver, unless all points are known."""
@@ -109,46 +116,57 @@ class HostProblem(Problem):
         """Of the evaluations for the judgement, those that a function without noise leaves."""
         if takes_key(self.options):
             return 0
-        start = state.search.start
-        others = len(state.search.candidates(start, start))
-        return self.solver.final_evaluations(y) - 2 - others
+        return self.solver.final_evaluations(y) - 1 - self.host.contest(y, state).each
 
     def trial(self, y: PyTree, state: PointState) -> Trial:
         """The lowest point once more."""
-        point, fun = state.progress.lowest_y, state.progress.lowest_fun
-        points = jax.tree.map(lambda a: a[None], point)
-        again = self._values(y).at(points, jnp.asarray(0, jnp.int32))
-        return Trial(again, bool(~jnp.isfinite(fun) | differ(again[0], fun)))
+        contest = self.host.contest(y, state)
+        lowest, before = contest.each - 1, contest.progress.lowest_fun
+        again = self._funs(_rows_of(contest.points)[lowest : lowest + 1], 0)
+        return Trial(again, bool(~np.isfinite(before) | differ(again[0], before)))
 
     def judge(
         self, y: PyTree, state: PointState, trial: Trial | None = None
     ) -> tuple[PyTree, dict[str, Any]]:
-        """Decided on the host, so that nothing is compiled for it."""
-        values, parts = self._values(y), self.host.parts(y, state)
-        if trial is None:
-            return parts.judge(values, _loop)
-        if trial.noisy:
-            return parts.judge(values._replace(at=partial(_known_last, values.at, trial)), _loop)
-        y, stats = parts.judge(values, _once)
-        return y, stats | {"evaluations": stats["evaluations"] + 1}
+        """Decided on the host, so that the function is called by the program that it has."""
+        contest = self.host.contest(y, state, takes_key(self.options))
+        points, each, found, done = _rows_of(contest.points), contest.each, contest.unknown(), 0
+        constant = trial is not None and not trial.noisy
+        # in the first round the lowest point comes last, whose value a trial may have told
+        known = np.empty(0, found.dtype) if trial is None or constant else trial.fun
+        while contest.goes_on(done, found):
+            at = contest.round(done)[: each - len(known)]
+            found[each * done : each * (done + 1)] = np.append(self._funs(points[at], done), known)
+            known, done = known[:0], done + 1
+            if constant:
+                break
+        y, stats = self.host.decided(y, state, contest, done, found)
+        return y, stats | {"evaluations": np.asarray(stats["evaluations"]) + constant}
 
-    def _values(self, y: PyTree) -> Values:
+    def _funs(self, points: Float[np.ndarray, "m n"], number: int) -> Float[np.ndarray, " m"]:
         """The function itself, also where it is known: that may have been luck."""
+        if len(points) == 0:
+            return np.empty(0, points.dtype)
+        args = in_round(self.args, self.options, number)
+        evaluate = Flat.of(dataclasses.replace(self._evaluator, args=args))
+        rows = self._rows(evaluate, points, self.host.sizes.step, judging=True)
+        return np.asarray(_objectives(rows, self.solver.squares))
 
-        def at(points: PyTree[Array], number: Array) -> Array:
-            args = in_round(self.args, self.options, number)
-            evaluate = _evaluator(self, args, y)
-            vectors = jax.vmap(lambda y: evaluate.layout.vector(jax.tree.leaves(y)))(points)
-            return evaluate.funs(self._rows(evaluate, vectors, self.host.sizes.step, judging=True))
+    @functools.cached_property
+    def _evaluator(self) -> Evaluator:
+        parts = (getattr(self.solver, name, None) for name in ("batch_size", "sharding"))
+        return evaluator(self.fun, self.solver.squares, self.args, self.layout, *parts)
 
-        return Values(at, takes_key(self.options))
+    @functools.cached_property
+    def _evaluate(self) -> Flat:
+        return Flat.of(self._evaluator)
 
     def _rows(
-        self, evaluate: Evaluator, points: Array, at_once: int, judging: bool = False
+        self, evaluate: Flat, points: Array | np.ndarray, at_once: int, judging: bool = False
     ) -> Array:
         """What the function returns at points, so many at once, unless it is known."""
 
-        def fresh(points: Array) -> Array:
+        def fresh(points: Array | np.ndarray) -> Array:
             if not self.moved:
                 return rows_at(evaluate, points, at_once, self.quick)
             with jax.default_device(self.device):
@@ -160,40 +178,11 @@ class HostProblem(Problem):
         rows = self.known.fresh if judging else self.known.rows
         return rows(points, fresh)
 
-    def _answered(self) -> int:
-        return 0 if self.known is None else self.known.answered
 
-    def _exhausted(self) -> bool:
-        return self.known is not None and self.known.exhausted
+_objectives = jit_quickly(objectives, static_argnums=1)
 
 
-def _evaluator(problem: HostProblem, args: PyTree, y: PyTree) -> Evaluator:
-    solver = problem.solver
-    parts = (getattr(solver, name, None) for name in ("batch_size", "sharding"))
-    return evaluator(problem.fun, solver.squares, args, y, *parts)
-
-
-@eqx.filter_jit
-def _done(step: PointStep) -> Bool[Array, ""]:
-    return step.over()
-
-
-def _loop(more: Callable, body: Callable, state: Any) -> Any:
-    """`jax.lax.while_loop` on the host."""
-    while more(state):
-        state = body(state)
-    return state
-
-
-def _once(more: Callable, body: Callable, state: Any) -> Any:
-    """The same where one round is enough."""
-    return body(state)
-
-
-def _known_last(at: Callable, trial: Trial, points: PyTree[Array], number: Array) -> Array:
-    """The values `at` these points; in the first round that of the last one is known."""
-    if number > 0:
-        return at(points, number)
-    rest = jax.tree.map(lambda a: a[:-1], points)
-    more = len(jax.tree.leaves(rest)[0]) > 0
-    return jnp.concatenate([*([at(rest, number)] if more else []), trial.fun])
+def _rows_of(points: PyTree[np.ndarray]) -> Float[np.ndarray, "m n"]:
+    """Stacked points as vectors."""
+    leaves = [leaf.reshape(len(leaf), -1) for leaf in jax.tree.leaves(points)]
+    return np.concatenate(leaves, axis=1)

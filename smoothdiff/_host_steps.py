@@ -5,18 +5,21 @@ and only for those stages that a run comes to.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from smoothdiff._devices import default_platform
 from smoothdiff._flat import Flat
-from smoothdiff._programs import QUICKLY
+from smoothdiff._programs import jit_quickly
 from smoothdiff._solvers._base import smoothed_params
+from smoothdiff._solvers._judgement import Contest
 from smoothdiff._solvers._point_by_point import PointState, PointStep
 from smoothdiff._solvers._stages import Sizes
 
@@ -25,7 +28,9 @@ from smoothdiff._solvers._stages import Sizes
 _SHORT = 1_000_000
 
 
-class HostSteps(eqx.Module):
+# a call of a module's method makes a module, which takes a twentieth of a millisecond
+@dataclasses.dataclass(frozen=True)
+class HostSteps:
     """A solver that steps point by point, without a function.
 
     In the solver and the options all that does not decide shapes is an array.
@@ -33,7 +38,7 @@ class HostSteps(eqx.Module):
 
     solver: Any
     options: dict[str, Any]
-    sizes: Sizes = eqx.field(static=True)
+    sizes: Sizes
 
     @staticmethod
     def of(solver: Any, options: dict[str, Any], y: PyTree[Array]) -> "HostSteps":
@@ -52,14 +57,14 @@ class HostSteps(eqx.Module):
 
     def init(self, y: PyTree[Array], out: PyTree[jax.ShapeDtypeStruct]) -> PointState:
         """The first state for a function that returns this."""
-        return _first_state(self.solver, self.options, y, out)
+        return _first_state(Flat.of((self.solver, self.options, y, out))).tree()
 
     def propose(
         self, y: PyTree[Array], state: PointState, count: int | None = None
     ) -> tuple[Float[Array, "K n"], Any]:
         """The points of the next step, or so many of them, and what the model says of them."""
         propose, *_ = _compiled(state)
-        return propose(_flat(self, y, state), _sizes(self, count), int(state.search.stage))
+        return propose(self._at(y, state), self._sizes(count), int(state.search.stage))
 
     def told(
         self,
@@ -70,11 +75,15 @@ class HostSteps(eqx.Module):
         proposal: Any,
     ) -> tuple[PyTree, PointState, Bool[Array, ""]]:
         """The next iterate and state, and whether the solver wants to stop there."""
-        step, sizes = _flat(self, y, state), _sizes(self, len(points))
+        step, sizes = self._at(y, state), self._sizes(len(points))
         _, searched, counted = _compiled(state)
         after = searched(step, points, rows, proposal, sizes, int(state.search.stage))
         new_y, new_state, over = counted(step, points, rows, after, sizes)
         return new_y, new_state.tree(), over
+
+    def over(self, y: PyTree[Array], state: PointState) -> Bool[Array, ""]:
+        """Whether the solver wants to stop before a step."""
+        return _over(self._at(y, state), self.sizes)
 
     def learnt(
         self,
@@ -84,34 +93,49 @@ class HostSteps(eqx.Module):
         rows: Float[Array, "K P"],
     ) -> PointState:
         """The state with evaluations that it did not propose."""
-        return _learnt(self.parts(y, state), points, rows)
+        return _learnt(self._at(y, state), points, rows, self.sizes).tree()
+
+    def contest(self, y: PyTree[Array], state: PointState, takes_key: bool = False) -> Contest:
+        """Between which points the answer is, in NumPy's arrays."""
+        return jax.device_get(_contest(self._at(y, state), self.sizes, takes_key).tree())
+
+    def decided(
+        self,
+        y: PyTree[Array],
+        state: PointState,
+        contest: Contest,
+        done: int,
+        found: Float[np.ndarray, " m"],
+    ) -> tuple[PyTree, dict[str, Array]]:
+        """The best of these points, after so many rounds."""
+        rest = Flat.of(contest), np.int32(done), found
+        return _decided(self._at(y, state), self.sizes, *rest)
 
     def parts(self, y: PyTree[Array], state: PointState, count: int | None = None) -> PointStep:
         """The step, of so many evaluations if that is given."""
-        return PointStep(self.solver, _sizes(self, count), y, self.options, state)
+        return PointStep(self.solver, self._sizes(count), y, self.options, state)
+
+    @functools.cached_property
+    def _flat(self) -> Flat:
+        return Flat.of((self.solver, self.options))
+
+    def _at(self, y: PyTree[Array], state: PointState) -> tuple[Flat, PyTree, Flat]:
+        return self._flat, y, Flat.of(state)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # the structure of a module cannot be pickled
+        return HostSteps, (self.solver, self.options, self.sizes)
+
+    def _sizes(self, count: int | None) -> Sizes:
+        return self.sizes if count is None else self.sizes._replace(step=count)
 
 
-# functions, as a call of a method makes a module, which takes a tenth of a millisecond
-
-
-def _sizes(steps: HostSteps, count: int | None) -> Sizes:
-    return steps.sizes if count is None else steps.sizes._replace(step=count)
-
-
-def _flat(steps: HostSteps, y: PyTree[Array], state: PointState) -> tuple[Flat, PyTree, Flat]:
-    return Flat.of((steps.solver, steps.options)), y, Flat.of(state)
-
-
-@eqx.filter_jit
-def _first_state(solver: Any, options: dict[str, Any], y: PyTree[Array], out: PyTree) -> PointState:
+@jit_quickly
+def _first_state(flat: Flat) -> Flat:
+    solver, options, y, out = flat.tree()
     state = solver.init(None, y, None, options, out, None, frozenset())
     # weak types would compile the second step anew
-    return jax.tree.map(lambda a: jnp.asarray(a, a.dtype), state)
-
-
-@eqx.filter_jit
-def _learnt(step: PointStep, points: Array, rows: Array) -> PointState:
-    return step.learnt(points, rows)
+    return Flat.of(jax.tree.map(lambda a: jnp.asarray(a, a.dtype), state))
 
 
 def _step_of(flat: tuple[Flat, PyTree, Flat], sizes: Sizes) -> PointStep:
@@ -143,12 +167,35 @@ def _counted(
     return y, Flat.of(state), dataclasses.replace(step, y=y, state=state).over()
 
 
+# what is needed once or twice, and for what others have evaluated
+
+
+def _over_of(flat: tuple[Flat, PyTree, Flat], sizes: Sizes) -> Bool[Array, ""]:
+    return _step_of(flat, sizes).over()
+
+
+def _learnt_of(flat: tuple[Flat, PyTree, Flat], points: Array, rows: Array, sizes: Sizes) -> Flat:
+    return Flat.of(_step_of(flat, sizes).learnt(points, rows))
+
+
+def _contest_of(flat: tuple[Flat, PyTree, Flat], sizes: Sizes, takes_key: bool) -> Flat:
+    return Flat.of(_step_of(flat, sizes).contest(takes_key))
+
+
+def _decided_of(
+    flat: tuple[Flat, PyTree, Flat], sizes: Sizes, contest: Flat, done: Array, found: Array
+) -> tuple[PyTree, dict[str, Array]]:
+    return _step_of(flat, sizes).decided(contest.tree(), done, found)
+
+
+_over, _learnt = jit_quickly(_over_of, static_argnums=1), jit_quickly(_learnt_of, static_argnums=3)
+_contest = jit_quickly(_contest_of, static_argnums=(1, 2))
+_decided = jit_quickly(_decided_of, static_argnums=1)
+
 # the parts of a step, and which of their arguments are known when compiling
 _PARTS = {_propose: (1, 2), _searched: (4, 5), _counted: (4,)}
 _WELL = [jax.jit(part, static_argnums=known) for part, known in _PARTS.items()]
-_QUICKLY = [
-    jax.jit(part, static_argnums=known, compiler_options=QUICKLY) for part, known in _PARTS.items()
-]
+_QUICKLY = [jit_quickly(part, static_argnums=known) for part, known in _PARTS.items()]
 
 
 def _compiled(state: PointState) -> list[Callable]:

@@ -14,7 +14,7 @@ from smoothdiff._solvers._judgement import ROUNDING
 from smoothdiff._unit_space import UnitSpace
 
 # the rows at points, in units
-Evaluate = Callable[[Float[Array, "k n"]], Float[Array, "k P"]]
+Evaluate = Callable[[Float[Array | np.ndarray, "k n"]], Float[Array, "k P"]]
 
 # a function has no noise if it had the same value again at so many points, or so often, and never
 # another
@@ -66,7 +66,9 @@ class Known:
         enough = len(self._same) >= _ENOUGH or self._same.total() >= _OFTEN
         return enough and not self._noisy
 
-    def rows(self, points: Float[Array, "K n"], evaluate: Evaluate) -> Float[Array, "K P"]:
+    def rows(
+        self, points: Float[Array | np.ndarray, "K n"], evaluate: Evaluate
+    ) -> Float[Array, "K P"]:
         """What the function returns at these points, of which it is evaluated at the others."""
         if not self._sure:
             return self.fresh(points, evaluate)
@@ -82,13 +84,15 @@ class Known:
             found = {names[i]: row for i, row in zip(new, np.asarray(rows), strict=True)}
         return jnp.asarray(np.stack([found[n] if n in found else self._rows[n] for n in names]))
 
-    def fresh(self, points: Float[Array, "K n"], evaluate: Evaluate) -> Float[Array, "K P"]:
+    def fresh(
+        self, points: Float[Array | np.ndarray, "K n"], evaluate: Evaluate
+    ) -> Float[Array, "K P"]:
         """What the function returns at these points, evaluated at each."""
         rows = evaluate(points)
         self.learn(points, rows)
         return rows
 
-    def learn(self, points: Float[Array, "K n"], rows: Float[Array, "K P"]) -> None:
+    def learn(self, points: Float[Array | np.ndarray, "K n"], rows: Float[Array, "K P"]) -> None:
         """Keeps rows that the function returned."""
         if self._noisy:
             return
@@ -111,7 +115,7 @@ class Known:
             self._noisy = True
             self._rows.clear()
 
-    def _names(self, points: Float[Array, "K n"]) -> list[bytes]:
+    def _names(self, points: Float[Array | np.ndarray, "K n"]) -> list[bytes]:
         leaves = jax.tree.leaves(self._units.natural(self._layout.tree(points)))
         columns = [np.asarray(leaf) for leaf in leaves]
         return [b"".join(column[i].tobytes() for column in columns) for i in range(len(points))]

@@ -38,7 +38,7 @@ class Layout:
         ]
         return parts[0] if len(parts) == 1 else jnp.concatenate(parts)
 
-    def tree(self, x: Array, free: Sequence[Any] = ()) -> PyTree:
+    def tree(self, x: Array | np.ndarray, free: Sequence[Any] = ()) -> PyTree:
         """The pytree whose smoothed leaves come from the last axis of `x`, the others from `free`.
 
         Axes of `x` before the last lead the shape of every smoothed leaf.

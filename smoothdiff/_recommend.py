@@ -13,6 +13,7 @@ from jaxtyping import PyTree
 from smoothdiff._black_box import UnknownOutputError
 from smoothdiff._call_checks import check_call, check_number, check_residuals, explained
 from smoothdiff._default_solver import default_solver, share_of_range
+from smoothdiff._flat import Flat
 from smoothdiff._host_function import evaluator, rows_at
 from smoothdiff._limits import Limits
 from smoothdiff._look_around import WIDEST, View, look_around
@@ -151,7 +152,8 @@ def recommend(
     options, numbers = write_options(key, None, takes_key), itertools.count()
 
     def row(point: np.ndarray) -> np.ndarray:
-        evaluate = evaluator(fun, squares, in_step(args, options, next(numbers)), y)
+        seen = in_step(args, options, next(numbers))
+        evaluate = Flat.of(evaluator(fun, squares, seen, params.layout))
         return np.asarray(rows_at(evaluate, jnp.asarray(point)[None], 1)[0])
 
     def rows(points: np.ndarray) -> np.ndarray:

@@ -191,7 +191,7 @@ class Run:
             judged = self.problem.judge(self.y, self.state, self.trial)
             y, stats = jax.block_until_ready(judged)
         # a last batch that fails costs no more than the smoothed value
-        if not jnp.isfinite(stats["fun"]):
+        if not np.isfinite(stats["fun"]):
             raise self._nonfinite()
         numbers = {name: value.item() for name, value in stats.items()}
         return self._result(y, reason, **numbers)

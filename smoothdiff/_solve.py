@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, PyTree
 from tqdm import tqdm
@@ -143,5 +145,7 @@ def _begun(problem: Problem, y: PyTree, check: Callable[[PyTree], None]) -> tupl
         return problem.begin(y, check)
     problem.fun(y, problem.args)
     problem, state = problem.begin(y, check)
-    count = state.progress.evaluations
-    return problem, eqx.tree_at(lambda s: s.progress.evaluations, state, count + 1)
+    with problem.place():
+        # added by NumPy, for which nothing is compiled
+        count = jnp.asarray(np.asarray(state.progress.evaluations) + np.int32(1))
+    return problem, eqx.tree_at(lambda s: s.progress.evaluations, state, count)

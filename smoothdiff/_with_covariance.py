@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, PyTree
 
 from smoothdiff._covariance import Slopes, balance, slopes
+from smoothdiff._flat import Flat
 from smoothdiff._host_function import evaluator, rows_at, traced
 from smoothdiff._layout import layout_of
 from smoothdiff._parameter_errors import Answer
@@ -92,7 +93,7 @@ def with_covariance(
     unit_fun = units.wrap(fun) if any(units.spaces) else fun
     solver, y = result.solver, answer.y
     with reraise():
-        evaluate = evaluator(unit_fun, True, args, y, solver.batch_size)
+        evaluate = Flat.of(evaluator(unit_fun, True, args, layout_of(y), solver.batch_size))
         at_once = solver.sizes(y).step
         quick = is_short(traced(unit_fun, y, args)[0], at_once)
         rows = rows_at(evaluate, jnp.asarray(points), at_once, quick)

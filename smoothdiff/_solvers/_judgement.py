@@ -6,8 +6,10 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from smoothdiff._seen import Seen
@@ -23,11 +25,78 @@ _CLEARLY = 3.0
 ROUNDING = 64
 
 
+Number = Float[Array | np.ndarray, ""] | np.floating
+
+
 class Values(NamedTuple):
     """The function `at` stacked points, with the numbers of a round if it takes a key."""
 
     at: Callable[[PyTree[Array], Int[Array, ""]], Float[Array, " m"]]
     takes_key: bool
+
+
+class Contest(eqx.Module):
+    """The candidates for an answer, stacked, of which `each` are evaluated in a round.
+
+    First come those that were never evaluated, then the lowest point of the run, then others.
+    """
+
+    progress: Progress
+    points: PyTree[Array]
+    each: int = eqx.field(static=True)
+    takes_key: bool = eqx.field(static=True)
+
+    @staticmethod
+    def of(
+        progress: Progress,
+        takes_key: bool,
+        new: Sequence[PyTree[Array]],
+        old: Sequence[PyTree[Array]],
+    ) -> "Contest":
+        """Between these and the lowest point; all are new where numbers are fresh."""
+        if takes_key:
+            new, old = [*new, *old], []
+        candidates = *new, progress.lowest_y, *old
+        points = jax.tree.map(lambda *leaves: jnp.stack(leaves), *candidates)
+        return Contest(progress, points, 1 + len(new), takes_key)
+
+    def unknown(self) -> Float[np.ndarray, " m"]:
+        """The values of all rounds before the first."""
+        return np.full(self._rounds() * self.each, np.nan, self.progress.lowest_fun.dtype)
+
+    def round(self, done: int | Int[Array, ""]) -> Int[Array | np.ndarray, " each"]:
+        """Which points come next after so many rounds."""
+        at = np.arange(self.each, dtype=np.int32)
+        return (self.each * done + at) % len(jax.tree.leaves(self.points)[0])
+
+    def goes_on(
+        self, done: int | Int[Array, ""], found: Float[Array | np.ndarray, " m"]
+    ) -> Bool[Array | np.ndarray, ""] | np.bool:
+        """Whether another round is needed after these."""
+        again = self.takes_key | differ(found[self.each - 1], self.progress.lowest_fun)
+        return (done == 0) | ((done < self._rounds()) & again)
+
+    def decided(
+        self,
+        done: Int[Array, ""],
+        found: Float[Array, " m"],
+        estimate: Callable[[PyTree[Array]], tuple[Array, Array, Seen]],
+        batch: int,
+    ) -> tuple[PyTree[Array], dict[str, Array]]:
+        """The best point and the statistics of the run after so many rounds."""
+        if self.takes_key:
+            y, fun, differs = _clear_winner(found, self.points)
+        else:
+            y, fun, differs = _winner(found, self.points, self.progress, self.each - 1)
+        smoothed, stderr, seen = estimate(y)
+        last = seen.value.astype(found.dtype)
+        lower = ~differs & (last < fun)
+        y, fun = jax.tree.map(lambda a, b: jnp.where(lower, a, b), (seen.point, last), (y, fun))
+        evaluations = self.progress.evaluations + self.each * done + batch
+        return y, {"fun": fun, "smoothed": smoothed, "stderr": stderr, "evaluations": evaluations}
+
+    def _rounds(self) -> int:
+        return _rounds(len(jax.tree.leaves(self.points)[0]), self.each)
 
 
 def judged(
@@ -37,7 +106,6 @@ def judged(
     batch: int,
     new: Sequence[PyTree[Array]],
     old: Sequence[PyTree[Array]] = (),
-    loop: Callable = jax.lax.while_loop,
 ) -> tuple[PyTree[Array], dict[str, Array]]:
     """The best point and the statistics of the run.
 
@@ -61,7 +129,6 @@ def judged(
         batch: The evaluations that `estimate` makes.
         new: Candidates that were never evaluated.
         old: Candidates that were, so that without noise none of them is lower than the lowest.
-        loop: How to repeat evaluations; on the host by a loop of Python's.
 
     Returns:
         The point, and the statistics: `fun`, the function there; `smoothed` and `stderr`, from the
@@ -70,41 +137,28 @@ def judged(
         the first of the `new` ones wins, as on a plateau an iterate is further from the edges than
         a sample. A start that is the lowest point wins over equals.
     """
-    if values.takes_key:
-        new, old = [*new, *old], []
-    candidates = *new, progress.lowest_y, *old
-    points = jax.tree.map(lambda *leaves: jnp.stack(leaves), *candidates)
-    count, each = len(candidates), 1 + len(new)
-    rounds = _rounds(count, each)
-    dtype = progress.lowest_fun.dtype
+    return evaluated(Contest.of(progress, values.takes_key, new, old), values, estimate, batch)
 
-    def more(state: tuple[Array, Array]) -> Bool[Array, ""]:
-        done, found = state
-        again = values.takes_key | differ(found[each - 1], progress.lowest_fun)
-        return (done == 0) | ((done < rounds) & again)
+
+def evaluated(
+    contest: Contest,
+    values: Values,
+    estimate: Callable[[PyTree[Array]], tuple[Array, Array, Seen]],
+    batch: int = 0,
+) -> tuple[PyTree[Array], dict[str, Array]]:
+    """The same once it is known between which points."""
 
     # one loop, so that the function is compiled once, and every value of a point by one program
-    def evaluated(state: tuple[Array, Array]) -> tuple[Array, Array]:
+    def round(state: tuple[Array, Array]) -> tuple[Array, Array]:
         done, found = state
-        at = (each * done + jnp.arange(each, dtype=jnp.int32)) % count
-        fresh = values.at(jax.tree.map(lambda a: a[at], points), done).astype(dtype)
-        return done + 1, jax.lax.dynamic_update_slice(found, fresh, (each * done,))
+        at = contest.round(done)
+        fresh = values.at(jax.tree.map(lambda a: a[at], contest.points), done).astype(found.dtype)
+        found = jax.lax.dynamic_update_slice(found, fresh, (contest.each * done,))
+        return done + 1, found
 
-    none = jnp.asarray(0, jnp.int32), jnp.full(rounds * each, jnp.nan, dtype)
-    done: Array
-    found: Array
-    done, found = loop(more, evaluated, none)
-    if values.takes_key:
-        y, fun, differs = _clear_winner(found, points)
-    else:
-        y, fun, differs = _winner(found, points, progress, each - 1)
-
-    smoothed, stderr, seen = estimate(y)
-    last = seen.value.astype(dtype)
-    lower = ~differs & (last < fun)
-    y, fun = jax.tree.map(lambda a, b: jnp.where(lower, a, b), (seen.point, last), (y, fun))
-    evaluations = progress.evaluations + each * done + batch
-    return y, {"fun": fun, "smoothed": smoothed, "stderr": stderr, "evaluations": evaluations}
+    none = jnp.asarray(0, jnp.int32), jnp.asarray(contest.unknown())
+    done, found = jax.lax.while_loop(lambda state: contest.goes_on(*state), round, none)
+    return contest.decided(done, found, estimate, batch)
 
 
 @partial(jax.jit, static_argnums=3)
@@ -182,7 +236,8 @@ def _rounds(count: int, each: int) -> int:
     return -(-_REPEATS * count // each)
 
 
-def differ(again: Float[Array, ""], before: Float[Array, ""]) -> Bool[Array, ""]:
+def differ(again: Number, before: Number) -> Bool[Array | np.ndarray, ""] | np.bool:
     """Whether a value that was computed twice differs by more than rounding."""
     eps = ROUNDING * jnp.finfo(before.dtype).eps
-    return jnp.isfinite(before) & ~(jnp.abs(again - before) <= eps * jnp.abs(before))
+    # by operators, for NumPy's numbers as well
+    return (abs(before) < math.inf) & ~(abs(again - before) <= eps * abs(before))

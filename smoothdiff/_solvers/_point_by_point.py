@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -24,7 +23,7 @@ from smoothdiff._solvers._base import (
 from smoothdiff._solvers._box import anywhere, bounded
 from smoothdiff._solvers._evaluator import Evaluator, objectives
 from smoothdiff._solvers._history import History
-from smoothdiff._solvers._judgement import Values, judged, judging
+from smoothdiff._solvers._judgement import Contest, Values, evaluated, judging
 from smoothdiff._solvers._look import Look
 from smoothdiff._solvers._point_search import AbstractPointSearch
 from smoothdiff._solvers._random_numbers import in_step, takes_key
@@ -263,30 +262,35 @@ class PointStep(eqx.Module):
         there = jax.tree.map(lambda a, old: jnp.where(known, a[at], old), aux, here)
         return y, dataclasses.replace(state, aux=there), here
 
-    def judge(
-        self,
-        values: Values,
-        loop: Callable = jax.lax.while_loop,
-    ) -> tuple[PyTree[Array], dict[str, Array]]:
+    def judge(self, values: Values) -> tuple[PyTree[Array], dict[str, Array]]:
         """The best point of those seen and of what the models say, by its `values`.
 
         The smoothed function is that of the model, at no further evaluation.
         """
+        return evaluated(self.contest(values.takes_key), values, self._estimate)
+
+    def contest(self, takes_key: bool) -> Contest:
+        """Between which points it is."""
         progress, search = self.state.progress, self.state.search
         # the start's: a search on a plateau may end so far away that sigma is rounding there
         params = smoothed_params(self.solver, progress.start_y, progress.step, self.options)
-        unknown = jnp.asarray(jnp.nan, progress.lowest_fun.dtype)
-
-        def estimate(y: PyTree) -> tuple[Array, Array, Seen]:
-            smoothed = progress.lowest_fun + search.smoothing()
-            return smoothed, unknown, Seen(y, jnp.full_like(unknown, jnp.inf))
-
         lowest_theta = params.layout.vector(jax.tree.leaves(progress.lowest_y))
         others = search.candidates(params.theta, lowest_theta)
         new = [params.layout.tree(params.clip(theta)) for theta in others]
         # with a key, the lowest of all is no higher than the start by the same numbers
-        old = [] if values.takes_key else [progress.start_y]
-        return judged(progress, values, estimate, 0, new, old, loop)
+        return Contest.of(progress, takes_key, new, [] if takes_key else [progress.start_y])
+
+    def decided(
+        self, contest: Contest, done: Array, found: Array
+    ) -> tuple[PyTree[Array], dict[str, Array]]:
+        """The best of these points, after so many rounds."""
+        return contest.decided(done, found, self._estimate, 0)
+
+    def _estimate(self, y: PyTree[Array]) -> tuple[Array, Array, Seen]:
+        lowest_fun = self.state.progress.lowest_fun
+        unknown = jnp.asarray(jnp.nan, lowest_fun.dtype)
+        smoothed = lowest_fun + self.state.search.smoothing()
+        return smoothed, unknown, Seen(y, jnp.full_like(unknown, jnp.inf))
 
 
 def _samples(solver: Any, key: Array, search: AbstractPointSearch, count: int) -> Array:
