@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from smoothdiff._devices import default_platform
 from smoothdiff._flat import Flat
 from smoothdiff._programs import jit_quickly
 from smoothdiff._solvers._base import smoothed_params
@@ -170,27 +169,27 @@ def _counted(
 # what is needed once or twice, and for what others have evaluated
 
 
-def _over_of(flat: tuple[Flat, PyTree, Flat], sizes: Sizes) -> Bool[Array, ""]:
+@functools.partial(jit_quickly, static_argnums=1)
+def _over(flat: tuple[Flat, PyTree, Flat], sizes: Sizes) -> Bool[Array, ""]:
     return _step_of(flat, sizes).over()
 
 
-def _learnt_of(flat: tuple[Flat, PyTree, Flat], points: Array, rows: Array, sizes: Sizes) -> Flat:
+@functools.partial(jit_quickly, static_argnums=3)
+def _learnt(flat: tuple[Flat, PyTree, Flat], points: Array, rows: Array, sizes: Sizes) -> Flat:
     return Flat.of(_step_of(flat, sizes).learnt(points, rows))
 
 
-def _contest_of(flat: tuple[Flat, PyTree, Flat], sizes: Sizes, takes_key: bool) -> Flat:
+@functools.partial(jit_quickly, static_argnums=(1, 2))
+def _contest(flat: tuple[Flat, PyTree, Flat], sizes: Sizes, takes_key: bool) -> Flat:
     return Flat.of(_step_of(flat, sizes).contest(takes_key))
 
 
-def _decided_of(
+@functools.partial(jit_quickly, static_argnums=1)
+def _decided(
     flat: tuple[Flat, PyTree, Flat], sizes: Sizes, contest: Flat, done: Array, found: Array
 ) -> tuple[PyTree, dict[str, Array]]:
     return _step_of(flat, sizes).decided(contest.tree(), done, found)
 
-
-_over, _learnt = jit_quickly(_over_of, static_argnums=1), jit_quickly(_learnt_of, static_argnums=3)
-_contest = jit_quickly(_contest_of, static_argnums=(1, 2))
-_decided = jit_quickly(_decided_of, static_argnums=1)
 
 # the parts of a step, and which of their arguments are known when compiling
 _PARTS = {_propose: (1, 2), _searched: (4, 5), _counted: (4,)}
@@ -199,6 +198,5 @@ _QUICKLY = [jit_quickly(part, static_argnums=known) for part, known in _PARTS.it
 
 
 def _compiled(state: PointState) -> list[Callable]:
-    """The parts for a history of this size, where new arrays are."""
-    short = state.search.history.rows.size < _SHORT
-    return _QUICKLY if short and default_platform() == "cpu" else _WELL
+    """The parts for a history of this size."""
+    return _QUICKLY if state.search.history.rows.size < _SHORT else _WELL

@@ -19,13 +19,10 @@ _SHORT = 100_000
 
 
 def jit_quickly(fun: Callable, **options: Any) -> Callable:
-    """`jax.jit` of a function that runs on a CPU, so that compiling it takes little time."""
-
-    @functools.cache
-    def jitted() -> Callable:
-        return jax.jit(fun, compiler_options=_quickly(), **options)
-
-    return lambda *args: jitted()(*args)
+    """`jax.jit` so that compiling takes little time, where new arrays are on a CPU."""
+    well = jax.jit(fun, **options)
+    quickly = functools.cache(lambda: jax.jit(fun, compiler_options=_quickly(), **options))
+    return lambda *args: (quickly() if default_platform() == "cpu" else well)(*args)
 
 
 @functools.cache

@@ -75,7 +75,8 @@ class Run:
         reason = limits.reached(self.steps, count, seconds, lowest)
         if reason != "max_evaluations":
             return reason
-        fewer = count - self.problem.spare(self.y, self.state)
+        with self.problem.place():
+            fewer = count - self.problem.spare(self.y, self.state)
         later = limits.reached(self.steps, fewer, seconds, lowest)
         if later is None and self.trial is None:
             with reraise(), self.problem.place():

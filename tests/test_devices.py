@@ -22,7 +22,7 @@ cpu, other = jax.devices()
 plays = lambda device: "cpu" if device == cpu else "gpu"
 current = lambda: jax.config.jax_default_device or other
 jax.config.update("jax_default_device", other)
-for name in "_devices", "_host_steps", "_programs":
+for name in "_devices", "_programs":
     sys.modules["smoothdiff." + name].default_platform = lambda: plays(current())
 _host_problem.is_moved = lambda device: device != cpu
 

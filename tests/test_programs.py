@@ -1,12 +1,13 @@
-"""Which functions are compiled quickly: short programs, however long a host function takes."""
+"""What is compiled quickly, and how: short programs, however long a host function takes."""
 
 import jax
 import jax.numpy as jnp
 import pytest
 
 import smoothdiff as sd
+from smoothdiff import _programs
 from smoothdiff._devices import default_platform
-from smoothdiff._programs import is_short
+from smoothdiff._programs import is_short, jit_quickly
 
 BOX = sd.black_box(lambda y: y, jax.ShapeDtypeStruct((10,), jnp.float32))
 PICTURE = jnp.zeros((400, 400))
@@ -44,3 +45,12 @@ def test_few_numbers_are_short_on_the_cpu_alone(name):
 @pytest.mark.parametrize("name", LONG)
 def test_many_numbers_and_loops_are_not(name):
     assert not is_short(jax.make_jaxpr(LONG[name])(jnp.ones(10)))
+
+
+def test_options_that_this_xla_does_not_know_are_left_out(monkeypatch):
+    _programs._quickly.cache_clear()
+    monkeypatch.setattr(_programs, "_OLDER", {"xla_of_another_version": 1})
+    double = jit_quickly(lambda x, times: times * x, static_argnums=1)
+    assert double(jnp.ones(2), 2).tolist() == [2, 2]
+    assert _programs._quickly() == {"xla_backend_optimization_level": 0}
+    _programs._quickly.cache_clear()
