@@ -167,11 +167,9 @@ class HostProblem(Problem):
         """What the function returns at points, so many at once, unless it is known."""
 
         def fresh(points: Array | np.ndarray) -> Array:
-            if not self.moved:
-                return rows_at(evaluate, points, at_once, self.quick)
             with jax.default_device(self.device):
                 rows = rows_at(evaluate, points, at_once, self.quick)
-            return brought(rows)
+            return brought(rows) if self.moved else rows
 
         if self.known is None:
             return fresh(points)
