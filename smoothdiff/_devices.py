@@ -39,6 +39,13 @@ def where_committed(tree: PyTree) -> Any:
     return _chosen()
 
 
+def beside(tree: PyTree, array: Any) -> jax.Array | np.ndarray:
+    """The array of NumPy's, on the device that someone chose for these arrays, if there is one."""
+    chosen = (leaf for leaf in jax.tree.leaves(tree) if isinstance(leaf, jax.Array))
+    leaf = next((leaf for leaf in chosen if leaf.committed), None)
+    return array if leaf is None else jax.device_put(array, next(iter(leaf.devices())))
+
+
 def on_cpu() -> contextlib.AbstractContextManager:
     """Within this context new arrays are on a CPU, if JAX has one."""
     cpu = None if default_platform() == "cpu" else _cpu()

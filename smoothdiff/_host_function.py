@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -49,4 +50,5 @@ def _rows_of(evaluate: Flat, points: Float[Array, "K n"]) -> Float[Array, "K P"]
     return evaluate.tree()(points)[0]
 
 
-_rows, _rows_quickly = jax.jit(_rows_of), jit_quickly(_rows_of)
+# equinox says what its `error_if` says, and keeps JAX from logging what a host function raises
+_rows, _rows_quickly = eqx.filter_jit(_rows_of), jit_quickly(_rows_of, eqx.filter_jit)

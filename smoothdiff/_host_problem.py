@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from smoothdiff._call_checks import check_squares
-from smoothdiff._devices import brought, is_moved, on_cpu, where_committed
+from smoothdiff._devices import beside, brought, is_moved, on_cpu, where_committed
 from smoothdiff._flat import Flat
 from smoothdiff._host_function import evaluator, rows_at, traced
 from smoothdiff._host_steps import HostSteps
@@ -26,7 +26,7 @@ from smoothdiff._solvers._point_by_point import PointState
 from smoothdiff._solvers._random_numbers import in_round, takes_key
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class HostProblem(Problem):
     """A problem whose solver steps point by point.
 
@@ -122,34 +122,40 @@ class HostProblem(Problem):
         """The lowest point once more."""
         contest = self.host.contest(y, state)
         lowest, before = contest.each - 1, contest.progress.lowest_fun
-        again = self._funs(_rows_of(contest.points)[lowest : lowest + 1], 0)
-        return Trial(again, bool(~np.isfinite(before) | differ(again[0], before)))
+        again = self._funs(y, _vectors(contest.points)[lowest : lowest + 1], 0)
+        with _extremes():
+            return Trial(again, bool(~np.isfinite(before) | differ(again[0], before)))
 
     def judge(
         self, y: PyTree, state: PointState, trial: Trial | None = None
     ) -> tuple[PyTree, dict[str, Any]]:
-        """Decided on the host, so that the function is called by the program that it has."""
+        """With a loop on the host, where the function is called by the program that it has."""
         contest = self.host.contest(y, state, takes_key(self.options))
-        points, each, found, done = _rows_of(contest.points), contest.each, contest.unknown(), 0
+        points, each, found, done = _vectors(contest.points), contest.each, contest.unknown(), 0
         constant = trial is not None and not trial.noisy
         # in the first round the lowest point comes last, whose value a trial may have told
-        known = np.empty(0, found.dtype) if trial is None or constant else trial.fun
-        while contest.goes_on(done, found):
-            at = contest.round(done)[: each - len(known)]
-            found[each * done : each * (done + 1)] = np.append(self._funs(points[at], done), known)
-            known, done = known[:0], done + 1
-            if constant:
-                break
+        told = np.empty(0, found.dtype) if trial is None or constant else trial.fun
+        with _extremes():
+            while contest.goes_on(done, found):
+                at = contest.round(done)[: each - len(told)]
+                fresh = self._funs(y, points[at], done)
+                found[each * done : each * (done + 1)] = np.append(fresh, told)
+                told, done = told[:0], done + 1
+                if constant:
+                    break
         y, stats = self.host.decided(y, state, contest, done, found)
         return y, stats | {"evaluations": np.asarray(stats["evaluations"]) + constant}
 
-    def _funs(self, points: Float[np.ndarray, "m n"], number: int) -> Float[np.ndarray, " m"]:
+    def _funs(
+        self, y: PyTree, points: Float[np.ndarray, "m n"], number: int
+    ) -> Float[np.ndarray, " m"]:
         """The function itself, also where it is known: that may have been luck."""
         if len(points) == 0:
             return np.empty(0, points.dtype)
         args = in_round(self.args, self.options, number)
         evaluate = Flat.of(dataclasses.replace(self._evaluator, args=args))
-        rows = self._rows(evaluate, points, self.host.sizes.step, judging=True)
+        # points that are committed as in steps, so that they go to the same program
+        rows = self._rows(evaluate, beside(y, points), self.host.sizes.step, judging=True)
         return np.asarray(_objectives(rows, self.solver.squares))
 
     @functools.cached_property
@@ -167,9 +173,11 @@ class HostProblem(Problem):
         """What the function returns at points, so many at once, unless it is known."""
 
         def fresh(points: Array | np.ndarray) -> Array:
+            if not self.moved:
+                return rows_at(evaluate, points, at_once, self.quick)
             with jax.default_device(self.device):
                 rows = rows_at(evaluate, points, at_once, self.quick)
-            return brought(rows) if self.moved else rows
+            return brought(rows)
 
         if self.known is None:
             return fresh(points)
@@ -177,10 +185,12 @@ class HostProblem(Problem):
         return rows(points, fresh)
 
 
+# what NumPy would warn of: values that are infinite, or whose difference is
+_extremes = functools.partial(np.errstate, invalid="ignore", over="ignore")
 _objectives = jit_quickly(objectives, static_argnums=1)
 
 
-def _rows_of(points: PyTree[np.ndarray]) -> Float[np.ndarray, "m n"]:
+def _vectors(points: PyTree[np.ndarray]) -> Float[np.ndarray, "m n"]:
     """Stacked points as vectors."""
     leaves = [leaf.reshape(len(leaf), -1) for leaf in jax.tree.leaves(points)]
     return np.concatenate(leaves, axis=1)

@@ -28,7 +28,7 @@ _SHORT = 1_000_000
 
 
 # a call of a module's method makes a module, which takes a twentieth of a millisecond
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class HostSteps:
     """A solver that steps point by point, without a function.
 
@@ -110,9 +110,9 @@ class HostSteps:
         rest = Flat.of(contest), np.int32(done), found
         return _decided(self._at(y, state), self.sizes, *rest)
 
-    def parts(self, y: PyTree[Array], state: PointState, count: int | None = None) -> PointStep:
-        """The step, of so many evaluations if that is given."""
-        return PointStep(self.solver, self._sizes(count), y, self.options, state)
+    def parts(self, y: PyTree[Array], state: PointState) -> PointStep:
+        """The step."""
+        return PointStep(self.solver, self.sizes, y, self.options, state)
 
     @functools.cached_property
     def _flat(self) -> Flat:
@@ -166,7 +166,7 @@ def _counted(
     return y, Flat.of(state), dataclasses.replace(step, y=y, state=state).over()
 
 
-# what is needed once or twice, and for what others have evaluated
+# what is needed before and after the steps, and for what others have evaluated
 
 
 @functools.partial(jit_quickly, static_argnums=1)

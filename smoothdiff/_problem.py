@@ -32,7 +32,7 @@ class Function(eqx.Module):
 
 
 # no module: a call of a module's method makes a module, which takes a twentieth of a millisecond
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Problem:
     """What the steps have in common; its methods are the solver's, compiled."""
 

@@ -1,5 +1,6 @@
 """Which programs are compiled quickly: those that run so short that compiling takes longer."""
 
+import contextlib
 import functools
 import math
 from collections.abc import Callable
@@ -18,22 +19,21 @@ _OLDER = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_
 _SHORT = 100_000
 
 
-def jit_quickly(fun: Callable, **options: Any) -> Callable:
+def jit_quickly(fun: Callable, jit: Callable = jax.jit, **options: Any) -> Callable:
     """`jax.jit` so that compiling takes little time, where new arrays are on a CPU."""
-    well = jax.jit(fun, **options)
-    quickly = functools.cache(lambda: jax.jit(fun, compiler_options=_quickly(), **options))
+    well = jit(fun, **options)
+    quickly = functools.cache(lambda: jit(fun, compiler_options=_quickly(), **options))
     return lambda *args: (quickly() if default_platform() == "cpu" else well)(*args)
 
 
 @functools.cache
 def _quickly() -> dict[str, Any]:
     """The options of XLA's compiler, of which other versions may know fewer."""
-    options = _UNOPTIMISED | _OLDER
-    try:
-        with on_cpu():
-            jax.jit(lambda: 0, compiler_options=options)()
-    except jax.errors.JaxRuntimeError:
-        return _UNOPTIMISED
+    options = dict(_UNOPTIMISED)
+    for name, value in _OLDER.items():
+        with contextlib.suppress(jax.errors.JaxRuntimeError), on_cpu():
+            jax.jit(lambda: 0, compiler_options={name: value})()
+            options[name] = value
     return options
 
 

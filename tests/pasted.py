@@ -16,6 +16,7 @@ import optax  # noqa: F401
 from IPython.core.interactiveshell import InteractiveShell
 from IPython.core.pylabtools import activate_matplotlib
 from matplotlib_inline.backend_inline import configure_inline_support
+from traitlets.config import Config
 
 import smoothdiff  # noqa: F401
 
@@ -45,7 +46,7 @@ def run_notebook(path: Path, folder: Path, config: dict[str, bool | int]) -> Non
     """Runs the cells of a notebook as Jupyter does, with its magic and its pictures."""
     os.chdir(path.parent)
     begin(folder, config)
-    shell = InteractiveShell.instance()
+    shell = InteractiveShell.instance(config=Config({"HistoryManager": {"enabled": False}}))
     activate_matplotlib(INLINE)
     configure_inline_support(shell, INLINE)
     cells = [cell for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]

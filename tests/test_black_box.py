@@ -632,6 +632,16 @@ def test_keyboard_interrupt_while_an_executor_works():
         black_box(interrupted, 0.0, executor=pool, on_error="nan")(1.0)
 
 
+def test_in_a_run_jax_logs_nothing_beside_the_error(caplog):
+    def stuck(y):
+        raise ValueError("the solver is stuck")
+
+    box = sd.black_box(stuck, out=0.0)
+    with pytest.raises(sd.MinimiseError, match="the solver is stuck"):
+        sd.minimise(lambda y, args: box(y), jnp.ones(2), key=jax.random.key(0))
+    assert not caplog.records
+
+
 def test_nan_on_error_in_every_output_of_the_sample(caplog):
     box = black_box(lambda x: (fragile(x), x), (0.0, np.zeros(2)), on_error="nan")
     with caplog.at_level(logging.INFO, "smoothdiff"):

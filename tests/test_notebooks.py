@@ -18,6 +18,7 @@ def test_notebook_runs(path: Path, tmp_path, context):
     quick = {"jax_disable_most_optimizations": True, "jax_traceback_in_locations_limit": 0}
     process = context.Process(target=pasted.run_notebook, args=(path, tmp_path, quick))
     process.start()
-    process.join()
+    process.join(600)
+    process.kill()
     printed, errors = ((tmp_path / name).read_text() for name in (pasted.OUT, pasted.ERRORS))
     assert process.exitcode == 0, f"{printed}\n{errors}"

@@ -49,8 +49,9 @@ def test_many_numbers_and_loops_are_not(name):
 
 def test_options_that_this_xla_does_not_know_are_left_out(monkeypatch):
     _programs._quickly.cache_clear()
-    monkeypatch.setattr(_programs, "_OLDER", {"xla_of_another_version": 1})
+    known = _programs._OLDER
+    monkeypatch.setattr(_programs, "_OLDER", known | {"xla_of_another_version": 1})
     double = jit_quickly(lambda x, times: times * x, static_argnums=1)
     assert double(jnp.ones(2), 2).tolist() == [2, 2]
-    assert _programs._quickly() == {"xla_backend_optimization_level": 0}
+    assert _programs._quickly().keys() <= {"xla_backend_optimization_level", *known}
     _programs._quickly.cache_clear()

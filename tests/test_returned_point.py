@@ -3,6 +3,7 @@
 The problems are branches of one black box, so that each solver is compiled once for all of them.
 """
 
+import contextlib
 import functools
 
 import jax
@@ -312,6 +313,16 @@ def test_what_rounding_does_is_no_noise_and_what_luck_did_is():
     # the other candidate was seen before, so that nothing was to be expected of it without noise
     np.testing.assert_array_equal(y, 1)
     np.testing.assert_array_equal(stats["fun"], 2)
+
+
+@pytest.mark.parametrize("value", [np.inf, -np.inf, np.nan, 3e38])
+def test_values_that_are_infinite_are_no_reason_to_warn(value):
+    fun = lambda y, args: jnp.where(y[0] > 0, jnp.float32(value), -jnp.float32(value))
+    solver = sd.NewtonCG(0.3, nonfinite="drop")
+    with contextlib.suppress(sd.MinimiseError):
+        sd.minimise(fun, jnp.ones(2), key=KEY, solver=solver, max_steps=0)
+    with contextlib.suppress(sd.MinimiseError):
+        sd.minimise(fun, jnp.ones(2), key=KEY, solver=solver, max_evaluations=12)
 
 
 def test_float64_residuals_of_float32_parameters_are_no_noise(x64):

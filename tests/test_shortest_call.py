@@ -270,14 +270,17 @@ def test_the_host_takes_the_steps_of_optimistix(x64):
 # compiled once
 
 
+@pytest.mark.parametrize("committed", [False, True])
 @pytest.mark.parametrize("solver", quick_of([sd.GaussNewton, sd.NewtonCG], [sd.NewtonCG]))
-def test_another_function_or_sigma_compiles_nothing_but_the_function(solver, caplog):
+def test_another_function_or_sigma_compiles_nothing_but_the_function(solver, committed, caplog):
     traced = []
+    start = jax.device_put(jnp.ones(3), jax.devices()[0] if committed else None)
+    assert start.committed == committed
     jax.clear_caches()
 
     def run(fun, key, sigma):
         call: Any = sd.least_squares if solver is sd.GaussNewton else sd.minimise
-        call(fun, jnp.ones(3), key=key, solver=solver(sigma), max_steps=30)
+        call(fun, start, key=key, solver=solver(sigma), max_steps=30)
 
     def residuals(shift):
         def fun(y, _):

@@ -61,7 +61,7 @@ class Contest(eqx.Module):
         return Contest(progress, points, 1 + len(new), takes_key)
 
     def unknown(self) -> Float[np.ndarray, " m"]:
-        """The values of all rounds before the first."""
+        """Of all rounds, before the first: NaN."""
         return np.full(self._rounds() * self.each, np.nan, self.progress.lowest_fun.dtype)
 
     def round(self, done: int | Int[Array, ""]) -> Int[Array | np.ndarray, " each"]:
@@ -146,10 +146,10 @@ def evaluated(
     estimate: Callable[[PyTree[Array]], tuple[Array, Array, Seen]],
     batch: int = 0,
 ) -> tuple[PyTree[Array], dict[str, Array]]:
-    """The same once it is known between which points."""
+    """The same between the points of a contest."""
 
     # one loop, so that the function is compiled once, and every value of a point by one program
-    def round(state: tuple[Array, Array]) -> tuple[Array, Array]:
+    def one_round(state: tuple[Array, Array]) -> tuple[Array, Array]:
         done, found = state
         at = contest.round(done)
         fresh = values.at(jax.tree.map(lambda a: a[at], contest.points), done).astype(found.dtype)
@@ -157,7 +157,7 @@ def evaluated(
         return done + 1, found
 
     none = jnp.asarray(0, jnp.int32), jnp.asarray(contest.unknown())
-    done, found = jax.lax.while_loop(lambda state: contest.goes_on(*state), round, none)
+    done, found = jax.lax.while_loop(lambda state: contest.goes_on(*state), one_round, none)
     return contest.decided(done, found, estimate, batch)
 
 
