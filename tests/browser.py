@@ -47,6 +47,10 @@ class Browser:
         self.command("Emulation.setEmulatedMedia", {"features": [scheme]})
         self._call("POST", f"{self._session}/url", {"url": "about:blank"})
         self._call("POST", f"{self._session}/url", {"url": f"{page.as_uri()}{at}"})
+        # on a busy machine the driver comes back from a long page before its end
+        ends = time.monotonic() + PATIENCE
+        while self.ask("return document.readyState") != "complete" and time.monotonic() < ends:
+            time.sleep(0.1)
 
     def command(self, name: str, given: dict[str, Any]) -> None:
         """A command of the browser's own protocol."""
