@@ -46,8 +46,8 @@ def rows_at(
     return jnp.concatenate(parts)
 
 
-def _rows_of(evaluate: Flat, points: Float[Array, "K n"]) -> Float[Array, "K P"]:
-    return evaluate.tree()(points)[0]
+def _rows_of(evaluate: Flat, points: Float[Array | np.ndarray, "K n"]) -> Float[Array, "K P"]:
+    return evaluate.tree()(jnp.asarray(points))[0]
 
 
 # equinox says what its `error_if` says, and keeps JAX from logging what a host function raises
