@@ -33,17 +33,14 @@ def is_moved(device: Any) -> bool:
 
 def where_committed(tree: PyTree) -> Any:
     """The device that someone chose for these arrays, else the one where JAX puts new arrays."""
-    for leaf in jax.tree.leaves(tree):
-        if isinstance(leaf, jax.Array) and leaf.committed:
-            return next(iter(leaf.devices()))
-    return _chosen()
+    device = _committed(tree)
+    return _chosen() if device is None else device
 
 
-def beside(tree: PyTree, array: Any) -> jax.Array | np.ndarray:
-    """The array of NumPy's, on the device that someone chose for these arrays, if there is one."""
-    chosen = (leaf for leaf in jax.tree.leaves(tree) if isinstance(leaf, jax.Array))
-    leaf = next((leaf for leaf in chosen if leaf.committed), None)
-    return array if leaf is None else jax.device_put(array, next(iter(leaf.devices())))
+def beside(tree: PyTree, array: np.ndarray) -> jax.Array | np.ndarray:
+    """The array, on the device that someone chose for those of the tree if there is one."""
+    device = _committed(tree)
+    return array if device is None else jax.device_put(array, device)
 
 
 def on_cpu() -> contextlib.AbstractContextManager:
@@ -75,6 +72,13 @@ def _brought(leaf: Any) -> Any:
         data = _brought(jax.random.key_data(leaf))
         return jax.random.wrap_key_data(data, impl=jax.random.key_impl(leaf))
     return jnp.asarray(np.asarray(leaf))
+
+
+def _committed(tree: PyTree) -> Any:
+    for leaf in jax.tree.leaves(tree):
+        if isinstance(leaf, jax.Array) and leaf.committed:
+            return next(iter(leaf.devices()))
+    return None
 
 
 def _chosen() -> Any:

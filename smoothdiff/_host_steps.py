@@ -95,7 +95,7 @@ class HostSteps:
         return _learnt(self._at(y, state), points, rows, self.sizes).tree()
 
     def contest(self, y: PyTree[Array], state: PointState, takes_key: bool = False) -> Contest:
-        """Between which points the answer is, in NumPy's arrays."""
+        """The candidates for the answer, in NumPy's arrays."""
         return jax.device_get(_contest(self._at(y, state), self.sizes, takes_key).tree())
 
     def decided(
@@ -106,12 +106,12 @@ class HostSteps:
         done: int,
         found: Float[np.ndarray, " m"],
     ) -> tuple[PyTree, dict[str, Array]]:
-        """The best of these points, after so many rounds."""
+        """The best candidate by the values of so many rounds, and the statistics of the run."""
         rest = Flat.of(contest), np.int32(done), found
         return _decided(self._at(y, state), self.sizes, *rest)
 
     def parts(self, y: PyTree[Array], state: PointState) -> PointStep:
-        """The step."""
+        """The step, for what is not compiled."""
         return PointStep(self.solver, self.sizes, y, self.options, state)
 
     @functools.cached_property

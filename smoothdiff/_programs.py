@@ -1,4 +1,4 @@
-"""Which programs are compiled quickly: those that run so short that compiling takes longer."""
+"""What is compiled quickly, and how: programs that run so short that compiling takes longer."""
 
 import contextlib
 import functools
@@ -20,7 +20,7 @@ _SHORT = 100_000
 
 
 def jit_quickly(fun: Callable, jit: Callable = jax.jit, **options: Any) -> Callable:
-    """`jax.jit` so that compiling takes little time, where new arrays are on a CPU."""
+    """The function, jitted so that compiling takes little time where new arrays are on a CPU."""
     well = jit(fun, **options)
     quickly = functools.cache(lambda: jit(fun, compiler_options=_quickly(), **options))
     return lambda *args: (quickly() if default_platform() == "cpu" else well)(*args)

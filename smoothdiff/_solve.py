@@ -7,8 +7,6 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
-import numpy as np
 import optimistix as optx
 from jaxtyping import Array, PyTree
 from tqdm import tqdm
@@ -16,7 +14,6 @@ from tqdm import tqdm
 from smoothdiff._black_box import UnknownOutputError
 from smoothdiff._call_checks import check_call, check_solver, explained
 from smoothdiff._default_solver import default_solver, share_of_range
-from smoothdiff._devices import beside
 from smoothdiff._host_problem import HostProblem
 from smoothdiff._host_samples import BlackBoxError
 from smoothdiff._known import Known
@@ -146,8 +143,5 @@ def _begun(problem: Problem, y: PyTree, check: Callable[[PyTree], None]) -> tupl
         return problem.begin(y, check)
     problem.fun(y, problem.args)
     problem, state = problem.begin(y, check)
-    with problem.place():
-        # added by NumPy, for which nothing is compiled
-        count = beside(state, np.asarray(state.progress.evaluations) + np.int32(1))
-        count = jnp.asarray(count)
-    return problem, eqx.tree_at(lambda s: s.progress.evaluations, state, count)
+    count = state.progress.evaluations
+    return problem, eqx.tree_at(lambda s: s.progress.evaluations, state, count + 1)

@@ -23,8 +23,7 @@ _REPEATS = 3
 _CLEARLY = 3.0
 # what rounding may do to a value that another program computes again, in units of its own
 ROUNDING = 64
-
-
+# of JAX or of NumPy
 Number = Float[Array | np.ndarray, ""] | np.floating
 
 
@@ -61,7 +60,7 @@ class Contest(eqx.Module):
         return Contest(progress, points, 1 + len(new), takes_key)
 
     def unknown(self) -> Float[np.ndarray, " m"]:
-        """Of all rounds, before the first: NaN."""
+        """The values of all rounds before any is known: NaN."""
         return np.full(self._rounds() * self.each, np.nan, self.progress.lowest_fun.dtype)
 
     def round(self, done: int | Int[Array, ""]) -> Int[Array | np.ndarray, " each"]:

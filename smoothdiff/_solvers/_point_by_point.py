@@ -270,7 +270,7 @@ class PointStep(eqx.Module):
         return evaluated(self.contest(values.takes_key), values, self._estimate)
 
     def contest(self, takes_key: bool) -> Contest:
-        """Between which points it is."""
+        """The candidates for the answer."""
         progress, search = self.state.progress, self.state.search
         # the start's: a search on a plateau may end so far away that sigma is rounding there
         params = smoothed_params(self.solver, progress.start_y, progress.step, self.options)
@@ -283,7 +283,7 @@ class PointStep(eqx.Module):
     def decided(
         self, contest: Contest, done: Array, found: Array
     ) -> tuple[PyTree[Array], dict[str, Array]]:
-        """The best of these points, after so many rounds."""
+        """The best candidate by the values of so many rounds, and the statistics of the run."""
         return contest.decided(done, found, self._estimate, 0)
 
     def _estimate(self, y: PyTree[Array]) -> tuple[Array, Array, Seen]:
