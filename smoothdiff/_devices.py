@@ -33,14 +33,13 @@ def is_moved(device: Any) -> bool:
 
 def where_committed(tree: PyTree) -> Any:
     """The device that someone chose for these arrays, else the one where JAX puts new arrays."""
-    device = _committed(tree)
-    return _chosen() if device is None else device
+    return next(iter(_committed(tree)), _chosen())
 
 
 def beside(tree: PyTree, array: np.ndarray) -> jax.Array | np.ndarray:
-    """The array, on the device that someone chose for those of the tree if there is one."""
-    device = _committed(tree)
-    return array if device is None else jax.device_put(array, device)
+    """The array, on the device that someone chose for those of the tree if it is one."""
+    devices = _committed(tree)
+    return jax.device_put(array, *devices) if len(devices) == 1 else array
 
 
 def on_cpu() -> contextlib.AbstractContextManager:
@@ -74,11 +73,12 @@ def _brought(leaf: Any) -> Any:
     return jnp.asarray(np.asarray(leaf))
 
 
-def _committed(tree: PyTree) -> Any:
+def _committed(tree: PyTree) -> set[Any]:
+    """The devices of the first array that someone put where it is, or none."""
     for leaf in jax.tree.leaves(tree):
         if isinstance(leaf, jax.Array) and leaf.committed:
-            return next(iter(leaf.devices()))
-    return None
+            return leaf.devices()
+    return set()
 
 
 def _chosen() -> Any:
