@@ -190,7 +190,7 @@ def _jax_function(host: HostFunction, outputs: Outputs) -> Callable[..., Any]:
     def call(*args):
         leaves, tree = jax.tree.flatten(args)
         ndims, shapes = tuple(leaf.ndim for leaf in leaves), outputs.shapes()
-        callback = _Callback(host, tree, ndims, outputs.tree, shapes)
+        callback = _Callback(host, tree, ndims, outputs.tree, shapes, _is_x64())
         # Under vmap, however nested, one callback gets the whole batch.
         results = jax.pure_callback(callback, shapes, *leaves, vmap_method="expand_dims")
         return outputs.tree.unflatten(results)
@@ -244,9 +244,12 @@ class _Callback:
     ndims: tuple[int, ...]
     out_tree: Any
     shapes: tuple[jax.ShapeDtypeStruct, ...]
+    x64: bool
 
     def __call__(self, *leaves: Any) -> list[np.ndarray]:
         try:
+            if self.x64 and not _is_x64():  # JAX would round arguments to float32
+                raise BlackBoxError(_X64.format(self.host.name))
             wait_for(leaves, self.host.name)
             samples = Samples(leaves, self.ndims, self.tree)
             outs = [np.empty((len(samples), *out.shape), out.dtype) for out in self.shapes]
@@ -255,6 +258,17 @@ class _Callback:
         except BaseException as error:
             was_raised(error)
             raise
+
+
+_X64 = (
+    "the black box {!r} is part of a program in float64, but JAX calls it from another thread, and "
+    "jax.enable_x64(True) holds in one thread alone: write "
+    'jax.config.update("jax_enable_x64", True) instead, at the start of the program'
+)
+
+
+def _is_x64() -> bool:
+    return jnp.result_type(float) == np.float64
 
 
 def _array(leaf: Any) -> jax.Array:

@@ -257,6 +257,17 @@ def test_types_follow_x64_when_called(x64):
     assert jax.jit(jax.vmap(box))(jnp.ones((3, 2))).dtype == jnp.float64
 
 
+def test_float64_that_is_on_in_another_thread_alone_is_an_error(x64, monkeypatch):
+    def elsewhere(callback, shapes, *leaves, vmap_method):
+        with jax.enable_x64(False):  # as in a thread of JAX's
+            return callback(*leaves)
+
+    monkeypatch.setattr(jax, "pure_callback", elsewhere)
+    box = black_box(lambda x: x / 3, np.zeros(2))
+    with pytest.raises(BlackBoxError, match=r'update\("jax_enable_x64", True\) instead'):
+        box(jnp.ones(2))
+
+
 @pytest.mark.parametrize(
     ("returned", "expected"),
     [
