@@ -30,7 +30,7 @@ from smoothdiff._solvers._ratio_test import (
     taken_by_rounding,
 )
 
-# the radius grows only if the change of the residuals was predicted with an error below this share
+# the end of a step was as predicted if the change of the residuals was, but for this share
 _PREDICTED = 0.5
 # a model is right about a check whose change it predicted with an error below this share
 _RIGHT = 0.1
@@ -238,8 +238,8 @@ class TrustRegion(eqx.Module):
         lower = jnp.minimum(self.radius, length) * share
         wait = proposal.poor & (fails < 2) & ~self.improve & ~long
         radius = jnp.where(failed & ~wait, lower, self.radius)
-        grow = held & (error < _PREDICTED)
-        radius = jnp.where(grow, jnp.maximum(radius, 2 * length), radius)
+        # single residuals may jump while the loss comes down as predicted
+        radius = jnp.where(held, jnp.maximum(radius, 2 * length), radius)
         check = self._checked(proposal, row, rows[0], good[0] & compared)
         after = jnp.minimum(check.factor * radius, jnp.maximum(radius, 1))
         radius = jnp.where(~tried & ~self.improve & ~lost, after, radius)
@@ -253,12 +253,14 @@ class TrustRegion(eqx.Module):
             error=jnp.where(failed, error, self.error),
             length=jnp.where(failed, length, self.length),
             slow=jnp.where(
-                (lowest < (1 - _LITTLE) * before) | grow | check.right, 0, self.slow + len(rows)
+                (lowest < (1 - _LITTLE) * before) | held | check.right, 0, self.slow + len(rows)
             ),
             worked=self.worked | (tried & ~failed),
             settled=check.right | settled(self.settled, outcome, length, tested[best]),
             right=check.right,
-            foreseen=jnp.where(grow, jnp.maximum(self.foreseen, length), self.foreseen),
+            foreseen=jnp.where(
+                held & (error < _PREDICTED), jnp.maximum(self.foreseen, length), self.foreseen
+            ),
         )
         return revised
 
