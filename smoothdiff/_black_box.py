@@ -89,7 +89,8 @@ def black_box(
         BlackBoxError: When it runs, if `fun` fails and this is not to become a NaN. Out of a
             `jax.jit` of your own comes an error of JAX's (JaxRuntimeError or ValueError) with the
             same message. On a GPU that error comes out of any transform, once its result is waited
-            for. What was turned into NaN is logged to "smoothdiff" at level INFO.
+            for. What was turned into NaN is logged to "smoothdiff" at level INFO. Also if float64
+            is on in one thread alone, by `jax.enable_x64`, and JAX calls `fun` from another.
         TypeError: If `fun`, `out` or `executor` is of the wrong type; later, if the function is
             differentiated or called with a typed key, or if JAX traces it before a call has found
             `out`.
@@ -268,7 +269,8 @@ _X64 = (
 
 
 def _is_x64() -> bool:
-    return jnp.result_type(float) == np.float64
+    """Whether float64 is on in this thread."""
+    return jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _array(leaf: Any) -> jax.Array:

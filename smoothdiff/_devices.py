@@ -36,8 +36,11 @@ def where_committed(tree: PyTree) -> Any:
     return next(iter(_committed(tree)), _chosen())
 
 
-def beside(tree: PyTree, array: np.ndarray) -> jax.Array | np.ndarray:
-    """The array, on the device that someone chose for those of the tree if it is one."""
+def put_with(tree: PyTree, array: np.ndarray) -> jax.Array | np.ndarray:
+    """The array, on the device that someone chose for those of the tree.
+
+    Where there is none, or several share them out, it goes wherever it is wanted.
+    """
     devices = _committed(tree)
     return jax.device_put(array, *devices) if len(devices) == 1 else array
 

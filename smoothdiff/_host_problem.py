@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from smoothdiff._call_checks import check_squares
-from smoothdiff._devices import beside, brought, is_moved, on_cpu, where_committed
+from smoothdiff._devices import brought, is_moved, on_cpu, put_with, where_committed
 from smoothdiff._flat import Flat
 from smoothdiff._host_function import evaluator, rows_at, traced
 from smoothdiff._host_steps import HostSteps
@@ -155,7 +155,7 @@ class HostProblem(Problem):
         args = in_round(self.args, self.options, number)
         evaluate = Flat.of(dataclasses.replace(self._evaluator, args=args))
         # points that are committed as in steps, so that they go to the same program
-        rows = self._rows(evaluate, beside(y, points), self.host.sizes.step, judging=True)
+        rows = self._rows(evaluate, put_with(y, points), self.host.sizes.step, judging=True)
         return np.asarray(_objectives(rows, self.solver.squares))
 
     @functools.cached_property

@@ -30,7 +30,7 @@ from smoothdiff._solvers._ratio_test import (
     taken_by_rounding,
 )
 
-# the end of a step was as predicted if the change of the residuals was, but for this share
+# a step is foreseen if the change of the residuals was predicted with an error below this share
 _PREDICTED = 0.5
 # a model is right about a check whose change it predicted with an error below this share
 _RIGHT = 0.1
@@ -83,7 +83,7 @@ class TrustRegion(eqx.Module):
     all; `error` and `length` are those of the last one. `worked` says that some step did not fail,
     and `slow` counts the evaluations in a row that lowered the loss by little or nothing, while the
     radius did not grow. The last step may be `settled`, see there, and the model `right` about a
-    check. `foreseen` is the length of the longest step whose end was as predicted.
+    check. `foreseen` is the length of the longest step that held and was foreseen.
     """
 
     radius: Float[Array, ""]
