@@ -1,14 +1,11 @@
 """Uniform random numbers by row: independent, or Sobol's sequence with Owen's scrambling."""
 
-from functools import lru_cache
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, Key, UInt32
 
-# scipy has direction numbers (Joe and Kuo) for so many dimensions
-MAX_DIMENSION = 21_201
+from smoothdiff._directions import MAX_DIMENSION, directions
 
 
 def uniform_bits(
@@ -49,26 +46,11 @@ def midpoints(bits: UInt32[Array, "..."], dtype) -> Array:
     return (cell + 0.5) * 2.0**-width
 
 
-@lru_cache(maxsize=32)
-def _directions(n: int, bits: int) -> np.ndarray:
-    """The first `bits` direction numbers of each of n dimensions, shape (bits, n)."""
-    # scipy.stats is slow to import, and only those who draw Sobol points need it
-    from scipy.stats import qmc
-
-    sequence = qmc.Sobol(n, scramble=False, bits=32)
-    rows = []
-    for k in range(bits):
-        # scipy orders the points by Gray code: point 2^(k+1) - 1 is direction number k
-        sequence.reset().fast_forward(2 ** (k + 1) - 1)
-        rows.append(np.round(sequence.random(1)[0] * 2.0**32).astype(np.uint32))
-    return np.stack(rows)
-
-
 def _sobol(index: UInt32[Array, " m"], n: int, size: int) -> UInt32[Array, "m n"]:
     """Points `index` of the Sobol sequence as 32-bit fractions."""
     bits = max(1, (size - 1).bit_length())
     point = jnp.zeros((index.size, n), jnp.uint32)
-    for k, direction in enumerate(_directions(n, bits)):
+    for k, direction in enumerate(directions(n, bits)):
         bit = (index >> np.uint32(k)) & np.uint32(1)
         point ^= bit[:, None] * direction[None]
     return point

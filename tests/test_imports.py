@@ -5,6 +5,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 # the neighbours first, so that what comes after them is smoothdiff's own
 SCRIPT = """
 import json, sys
@@ -14,6 +16,11 @@ import smoothdiff
 print(json.dumps([sorted(before), sorted(sys.modules)]))
 """
 ALONE = "import json, sys, smoothdiff; print(json.dumps(sorted(sys.modules)))"
+DRAWN = """
+import json, sys, jax, smoothdiff
+smoothdiff.Sobol().draw(jax.random.key(0), 0, 4, 4, 2, jax.numpy.float32)
+print(json.dumps(sorted(sys.modules)))
+"""
 HEAVY = ("mitsuba", "drjit", "matplotlib", "dask", "distributed", "cma", "IPython", "scipy.stats")
 
 
@@ -29,8 +36,10 @@ def fresh(script):
     return json.loads(done.stdout)
 
 
-def test_import_brings_nothing_heavy_or_optional():
-    loaded = fresh(ALONE)
+@pytest.mark.parametrize("script", [ALONE, DRAWN], ids=["imported", "drawn"])
+def test_nothing_heavy_or_optional_is_loaded(script):
+    """By the import, or for points of Sobol's sequence."""
+    loaded = fresh(script)
     assert "smoothdiff" in loaded
     assert [name for name in HEAVY if name in loaded] == []
 

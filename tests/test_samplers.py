@@ -14,6 +14,7 @@ from parts import new_ones
 from scipy import integrate, stats
 
 import smoothdiff as sd
+from smoothdiff import _directions
 from smoothdiff._noise import as_sampler
 from tests.parts import quick_of
 
@@ -127,6 +128,20 @@ def fractions(sampler, num_samples, n):
     """The uniform numbers in [0, 1) that the points come from."""
     z, _ = draw(sampler, num_samples, n, dtype=jnp.float64)
     return stats.norm.cdf(np.asarray(z))
+
+
+@pytest.mark.parametrize(("n", "bits"), [(1, 8), (2, 1), (7, 5), (300, 20), (21_201, 4)])
+@pytest.mark.parametrize("has_file", [True, False])
+def test_direction_numbers_are_those_of_scipy(n, bits, has_file, monkeypatch, tmp_path):
+    """With scipy's file of them or, where that is not there, by its sequence."""
+    if not has_file:
+        monkeypatch.setattr(_directions, "_file", lambda: tmp_path / "none.npz")
+    numbers = _directions.directions.__wrapped__(n, bits)
+    sequence = stats.qmc.Sobol(n, scramble=False, bits=32)
+    for k, row in enumerate(numbers):
+        assert row.dtype == np.uint32
+        point = sequence.reset().fast_forward(2 ** (k + 1) - 1).random(1)[0]
+        np.testing.assert_array_equal(row / 2.0**32, point)
 
 
 @pytest.mark.parametrize("k", [1, 3, 6])
