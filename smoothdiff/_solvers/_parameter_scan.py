@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
 from smoothdiff._solvers._box import closed
+from smoothdiff._solvers._stages import where
 
 # evaluations along a parameter: in the try of the first parameters, in a first scan, and the most
 _TRY, _FIRST, _MOST = 16, 50, 200
@@ -73,9 +74,7 @@ class Scan(eqx.Module):
         """The try if there was none, or a longer scan after one; and whether there is any."""
         done, made = self.done(), self.made()
         first, longer = Scan.start(base, fun, params.sigma), self.again(base, fun)
-        scan = jax.tree.map(
-            lambda a, b, c: jnp.where(made, jnp.where(done, a, b), c), longer, self, first
-        )
+        scan = where(made, where(done, longer, self), first)
         return scan, ~scan.failed & closed(params)
 
     def propose(
@@ -117,9 +116,7 @@ class Scan(eqx.Module):
 
     def after(self, points: Float[Array, "K n"], funs: Float[Array, " K"]) -> "Scan":
         """With these values, infinite where there is none."""
-        return jax.tree.map(
-            lambda a, b: jnp.where(self.tests, a, b), self._tested(funs), self._lined(points, funs)
-        )
+        return where(self.tests, self._tested(funs), self._lined(points, funs))
 
     def done(self) -> Bool[Array, ""]:
         """Whether all parameters were scanned."""
@@ -179,4 +176,4 @@ class Scan(eqx.Module):
                 ~self.tried & (line == min(_TRIED, n)),
             ),
         )
-        return jax.tree.map(lambda a, b: jnp.where(ended, a, b), over, known)
+        return where(ended, over, known)

@@ -36,6 +36,7 @@ from smoothdiff._solvers._ratio_test import (
     ratio_test,
     settled,
 )
+from smoothdiff._solvers._stages import where
 
 # an evaluation so many radii away should make way for a nearer one
 _FAR = 2.0
@@ -151,11 +152,18 @@ class QuadraticTrust(eqx.Module):
         model = least_change(history, center, fun, self.metric, self.radius, self.hessian)
         grad, hessian, (constant, slope, bend) = model.grad, model.hessian, model.polynomial
 
-        def minimiser(hessian: Array, grad: Array, radius: Array) -> Array:
-            return self._within_bounds(hessian, grad, radius, center, params)
-
         tried = radii(self.radius, count)
-        steps = jax.vmap(lambda radius: minimiser(hessian, grad, radius))(tried)
+        # one piece of code solves all, as compiling it takes longer than running it: the steps, and
+        # the two ends of what the farthest evaluation determines alone, where one is wanted
+        signs, each = jnp.asarray([1, -1], grad.dtype), (len(tried), *hessian.shape)
+        problems = (
+            jnp.append(jnp.ones(len(tried), bool), jnp.full(2, self.improve)),
+            jnp.concatenate([jnp.broadcast_to(hessian, each), signs[:, None, None] * bend]),
+            jnp.concatenate([jnp.broadcast_to(grad, each[:2]), signs[:, None] * slope]),
+            jnp.append(tried, jnp.full(2, self.radius)),
+        )
+        steps = jax.lax.map(lambda problem: self._minimiser(*problem, center, params), problems)
+        steps, ends = steps[:-2], steps[-2:]
         change = lambda steps, slope, bend: (
             dot(steps, slope) + jnp.sum(dot(steps, bend) * steps, axis=1) / 2
         )
@@ -169,8 +177,7 @@ class QuadraticTrust(eqx.Module):
         )
 
         def other() -> Array:
-            """One of the two ends of what the farthest evaluation determines alone."""
-            ends = jnp.stack([minimiser(s * bend, s * slope, self.radius) for s in (1, -1)])
+            """One of the two ends."""
             return ends[jnp.argmax(jnp.abs(constant + change(ends, slope, bend)))]
 
         def checked() -> Array:
@@ -193,6 +200,19 @@ class QuadraticTrust(eqx.Module):
         lost &= jnp.linalg.norm(first) < INSIDE * self.radius
         said = asked.tight, model.determined, lost
         return Proposal(points, others, reduction, hessian, poor, check, rise, *said)
+
+    def _minimiser(
+        self,
+        wanted: Array,
+        hessian: Array,
+        grad: Array,
+        radius: Array,
+        center: Array,
+        params: Params,
+    ) -> Array:
+        """The minimiser within radius and bounds, or nothing where it is not wanted."""
+        minimiser = lambda: self._within_bounds(hessian, grad, radius, center, params)
+        return jax.lax.cond(wanted, minimiser, lambda: jnp.zeros_like(grad))
 
     def _within_bounds(
         self, hessian: Array, grad: Array, radius: Array, center: Array, params: Params
@@ -234,9 +254,7 @@ class QuadraticTrust(eqx.Module):
         right = proposal.check & is_right(before, funs[0], proposal.rise)
         usable = all_finite((metric, turn)) & (right | proposal.tight | proposal.determined)
         still = Metric.of(jnp.ones_like(proposal.points[0]), True)
-        metric, turn = jax.tree.map(
-            lambda a, b: jnp.where(usable, a, b), (metric, turn), (self.metric, still)
-        )
+        metric, turn = where(usable, (metric, turn), (self.metric, still))
         length = jnp.linalg.norm(turn.into(proposal.points[best]))
         tried = radii(self.radius, len(funs))
         # in the units that the step was made in

@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -14,7 +13,7 @@ from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._noisy_step import Trust, outcome, propose, revise
 from smoothdiff._solvers._point_search import nothing
 from smoothdiff._solvers._scalar_fit import ScalarFit, fit
-from smoothdiff._solvers._stages import Sizes
+from smoothdiff._solvers._stages import Sizes, where
 
 # how strongly the noise of the Hessian's eigenvalues counts in the metric
 _CAUTION = 6.0
@@ -115,7 +114,7 @@ class Center(eqx.Module):
         x, base = (jnp.where(back, points[lowest], a) for a in (x, base))
         narrower = _NARROWER * trust.width, jnp.zeros_like(new.reduction)
         there = eqx.tree_at(lambda t: (t.width, t.reduction), new, narrower)
-        new = jax.tree.map(lambda a, b: jnp.where(back, a, b), there, new)
+        new = where(back, there, new)
         after = Center(x, base, turned, new.times(unit))
         return after, value * unit, model.value_stderr(here) * unit
 

@@ -285,9 +285,7 @@ class ResidualSearch(AbstractPointSearch):
         )
         radius = jnp.maximum(jnp.asarray(radius), jnp.finfo(fun.dtype).eps)
         anew = TrustRegion.start(jnp.asarray(radius), *self.trust.jacobian.shape)
-        trust = jax.tree.map(
-            lambda a, b: jnp.where(came_true | found, a, b), anew, self.trust.resumed()
-        )
+        trust = where(came_true | found, anew, self.trust.resumed())
         stage = jnp.full_like(self.stage, TRUST)
         back = eqx.tree_at(lambda s: (s.stage, s.trust), self, (stage, trust))
         return where(came_true | (idle >= _IDLE * (len(self.start) + 1)), back, search)

@@ -3,8 +3,8 @@
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 # what is evaluated next: the first points, a step of the local model, samples around a center,
@@ -32,8 +32,13 @@ class Sizes(NamedTuple):
 
 
 def where(condition: Bool[Array, ""], a: Any, b: Any) -> Any:
-    """One of two pytrees; what is the same in both, such as the history, is not copied."""
-    return jax.tree.map(lambda a, b: a if a is b else jnp.where(condition, a, b), a, b)
+    """One of two pytrees; what is the same in both, such as the history, is not copied.
+
+    It is a branch: of a choice for each array, XLA computes what leads to the condition each time.
+    """
+    differ = jax.tree.map(lambda a, b: a is not b, a, b)
+    (a, same), (b, _) = eqx.partition(a, differ), eqx.partition(b, differ)
+    return eqx.combine(jax.lax.cond(condition, lambda: a, lambda: b), same)
 
 
 def by_stage(
