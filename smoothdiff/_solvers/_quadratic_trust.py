@@ -155,11 +155,11 @@ class QuadraticTrust(eqx.Module):
         tried = radii(self.radius, count)
         # one piece of code solves all, as compiling it takes longer than running it: the steps, and
         # the two ends of what the farthest evaluation determines alone, where one is wanted
-        signs, each = jnp.asarray([1, -1], grad.dtype), (len(tried), *hessian.shape)
+        each = (len(tried), *hessian.shape)
         problems = (
             jnp.append(jnp.ones(len(tried), bool), jnp.full(2, self.improve)),
-            jnp.concatenate([jnp.broadcast_to(hessian, each), signs[:, None, None] * bend]),
-            jnp.concatenate([jnp.broadcast_to(grad, each[:2]), signs[:, None] * slope]),
+            jnp.concatenate([jnp.broadcast_to(hessian, each), jnp.stack([bend, -bend])]),
+            jnp.concatenate([jnp.broadcast_to(grad, each[:2]), jnp.stack([slope, -slope])]),
             jnp.append(tried, jnp.full(2, self.radius)),
         )
         steps = jax.lax.map(lambda problem: self._minimiser(*problem, center, params), problems)
