@@ -162,7 +162,7 @@ class QuadraticTrust(eqx.Module):
             jnp.concatenate([jnp.broadcast_to(grad, each[:2]), jnp.stack([slope, -slope])]),
             jnp.append(tried, jnp.full(2, self.radius)),
         )
-        steps = jax.lax.map(lambda problem: self._minimiser(*problem, center, params), problems)
+        steps = jax.lax.map(lambda problem: self._solution(problem, center, params), problems)
         steps, ends = steps[:-2], steps[-2:]
         change = lambda steps, slope, bend: (
             dot(steps, slope) + jnp.sum(dot(steps, bend) * steps, axis=1) / 2
@@ -201,18 +201,11 @@ class QuadraticTrust(eqx.Module):
         said = asked.tight, model.determined, lost
         return Proposal(points, others, reduction, hessian, poor, check, rise, *said)
 
-    def _minimiser(
-        self,
-        wanted: Array,
-        hessian: Array,
-        grad: Array,
-        radius: Array,
-        center: Array,
-        params: Params,
-    ) -> Array:
+    def _solution(self, problem: tuple[Array, ...], center: Array, params: Params) -> Array:
         """The minimiser within radius and bounds, or nothing where it is not wanted."""
-        minimiser = lambda: self._within_bounds(hessian, grad, radius, center, params)
-        return jax.lax.cond(wanted, minimiser, lambda: jnp.zeros_like(grad))
+        wanted, hessian, grad, radius = problem
+        solve = lambda: self._within_bounds(hessian, grad, radius, center, params)
+        return jax.lax.cond(wanted, solve, lambda: jnp.zeros_like(grad))
 
     def _within_bounds(
         self, hessian: Array, grad: Array, radius: Array, center: Array, params: Params

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Int, PyTree
 
 # what is evaluated next: the first points, a step of the local model, samples around a center,
 # points further and further away, points anywhere within the bounds, or along a parameter
@@ -32,13 +32,16 @@ class Sizes(NamedTuple):
 
 
 def where(condition: Bool[Array, ""], a: Any, b: Any) -> Any:
-    """One of two pytrees; what is the same in both, such as the history, is not copied.
-
-    It is a branch: of a choice for each array, XLA computes what leads to the condition each time.
-    """
+    """One of two pytrees; what is the same in both, such as the history, is not copied."""
     differ = jax.tree.map(lambda a, b: a is not b, a, b)
     (a, same), (b, _) = eqx.partition(a, differ), eqx.partition(b, differ)
-    return eqx.combine(jax.lax.cond(condition, lambda: a, lambda: b), same)
+    return eqx.combine(_either(condition, a, b), same)
+
+
+@jax.jit
+def _either(condition: Bool[Array, ""], a: PyTree[Array], b: PyTree[Array]) -> PyTree[Array]:
+    """By a branch: XLA would compute what leads to the condition anew for each array it chooses."""
+    return jax.lax.cond(condition, lambda: a, lambda: b)
 
 
 def by_stage(
