@@ -1,7 +1,7 @@
 """The direction numbers of Sobol's sequence: those of Joe and Kuo, from scipy's own file.
 
-Importing scipy.stats for them takes a second, as long as a short run. Only where scipy has no such
-file is it asked.
+Importing scipy.stats for them takes a second, as long as a short run. It is asked only where that
+file is not as expected.
 """
 
 from functools import lru_cache
@@ -14,8 +14,8 @@ MAX_DIMENSION = 21_201
 
 
 @lru_cache(maxsize=32)
-def directions(n: int, bits: int) -> np.ndarray:
-    r"""The first `bits` direction numbers of each of n dimensions, shape (bits, n).
+def direction_numbers(n: int, bits: int) -> np.ndarray:
+    r"""The first `bits` direction numbers of each of n dimensions as 32-bit fractions, (bits, n).
 
     A dimension has a polynomial over the integers modulo 2, of degree s and with coefficients a,
     and its first s numbers. The others follow, number k as $m_k / 2^k$:
@@ -24,10 +24,11 @@ def directions(n: int, bits: int) -> np.ndarray:
 
     Source: Joe and Kuo 2008, equation 2.
     """
-    if not (file := _file()).exists():
+    try:
+        with np.load(_file()) as table:
+            polynomials, first = table["poly"][:n], table["vinit"][:n]
+    except (OSError, KeyError):
         return _by_scipy(n, bits)
-    with np.load(file) as table:
-        polynomials, first = table["poly"][:n], table["vinit"][:n]
     # the first dimension has no polynomial, and all its numbers are 1
     numbers = np.ones((n, bits), np.int64)
     degrees = np.frexp(polynomials)[1] - 1

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, Key, UInt32
 
-from smoothdiff._directions import MAX_DIMENSION, directions
+from smoothdiff._directions import MAX_DIMENSION, direction_numbers
 
 
 def uniform_bits(
@@ -50,7 +50,7 @@ def _sobol(index: UInt32[Array, " m"], n: int, size: int) -> UInt32[Array, "m n"
     """Points `index` of the Sobol sequence as 32-bit fractions."""
     bits = max(1, (size - 1).bit_length())
     point = jnp.zeros((index.size, n), jnp.uint32)
-    for k, direction in enumerate(directions(n, bits)):
+    for k, direction in enumerate(direction_numbers(n, bits)):
         bit = (index >> np.uint32(k)) & np.uint32(1)
         point ^= bit[:, None] * direction[None]
     return point

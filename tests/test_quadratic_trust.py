@@ -12,6 +12,7 @@ import pytest
 from smoothdiff._params import take_apart
 from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._history import History
+from smoothdiff._solvers._least_change import least_change
 from smoothdiff._solvers._quadratic_trust import QuadraticTrust
 
 N = 3
@@ -45,7 +46,7 @@ def around(count, width=1.0):
 
 # compiled, as in a solver
 START, REVISE = eqx.filter_jit(QuadraticTrust.start), eqx.filter_jit(QuadraticTrust.revise)
-STEP = jax.jit(bounded_step)
+STEP, MODEL = jax.jit(bounded_step), jax.jit(least_change)
 
 
 @eqx.filter_jit
@@ -142,6 +143,27 @@ def test_where_the_model_is_flat_the_step_is_for_the_geometry(x64):
     _, proposal, *_ = proposal_of(known(around(7), lambda x: 1.0), radius=0.5)
     assert proposal.reduction[0] == 0
     assert np.linalg.norm(proposal.points[0]) == pytest.approx(0.5, rel=1e-3)
+
+
+@pytest.mark.parametrize("count", [1, 6])
+def test_a_point_for_the_geometry_is_where_the_farthest_evaluation_says_most(count, x64):
+    """By its polynomial, over the ball; the other steps stay as they are."""
+    history = known(np.array([*around(7), [3.0, 3.0, 1.0]]), lambda x: bowl(x) + x[0] ** 3)
+    trust = START(jnp.ones(N), jnp.asarray(0.7))
+    steps, center, fun = propose(trust, history, None, count)
+    improving = eqx.tree_at(lambda t: t.improve, trust, jnp.asarray(True))
+    found, *_ = propose(improving, history, None, count)
+    np.testing.assert_allclose(found.points[1:], steps.points[1:], atol=1e-12)
+    model = MODEL(history, center, fun, trust.metric, trust.radius, trust.hessian)
+    constant, slope, bend = model.polynomial
+    size = lambda u: np.abs(constant + u @ slope + np.sum(u @ bend * u, axis=1) / 2)
+    u = np.random.default_rng(2).normal(size=(20_000, N))
+    u *= (
+        0.7
+        * np.random.default_rng(3).uniform(size=(len(u), 1))
+        / np.linalg.norm(u, axis=1)[:, None]
+    )
+    assert size(found.points[:1])[0] >= np.max(size(u))
 
 
 def of_check(trust, proposal, fun, rise):

@@ -131,17 +131,31 @@ def fractions(sampler, num_samples, n):
 
 
 @pytest.mark.parametrize(("n", "bits"), [(1, 8), (2, 1), (7, 5), (300, 20), (21_201, 4)])
-@pytest.mark.parametrize("has_file", [True, False])
-def test_direction_numbers_are_those_of_scipy(n, bits, has_file, monkeypatch, tmp_path):
-    """With scipy's file of them or, where that is not there, by its sequence."""
-    if not has_file:
-        monkeypatch.setattr(_directions, "_file", lambda: tmp_path / "none.npz")
-    numbers = _directions.directions.__wrapped__(n, bits)
+def test_direction_numbers_are_those_of_scipy(n, bits):
+    numbers = _directions.direction_numbers(n, bits)
     sequence = stats.qmc.Sobol(n, scramble=False, bits=32)
     for k, row in enumerate(numbers):
         assert row.dtype == np.uint32
         point = sequence.reset().fast_forward(2 ** (k + 1) - 1).random(1)[0]
         np.testing.assert_array_equal(row / 2.0**32, point)
+
+
+@pytest.mark.parametrize("file", ["none", "other"])
+def test_without_the_file_of_scipy_its_sequence_is_asked(file, monkeypatch, tmp_path):
+    numbers, path = _directions.direction_numbers(7, 5), tmp_path / "numbers.npz"
+    if file == "other":
+        np.savez(path, poly=np.ones(9, np.int64))
+    monkeypatch.setattr(_directions, "_file", lambda: path)
+    np.testing.assert_array_equal(_directions.direction_numbers.__wrapped__(7, 5), numbers)
+
+
+def test_the_last_direction_numbers_are_odd():
+    """Number k is odd in units of its last digit, 2^-k."""
+    numbers = _directions.direction_numbers(300, 32)
+    assert numbers.shape == (32, 300)
+    for k, row in enumerate(numbers):
+        assert np.all(row >> np.uint32(31 - k) & 1 == 1)
+        assert np.all(row & np.uint32(2 ** (31 - k) - 1) == 0)
 
 
 @pytest.mark.parametrize("k", [1, 3, 6])

@@ -177,7 +177,7 @@ class QuadraticTrust(eqx.Module):
         )
 
         def other() -> Array:
-            """One of the two ends."""
+            """The end where the polynomial of the farthest evaluation is larger in size."""
             return ends[jnp.argmax(jnp.abs(constant + change(ends, slope, bend)))]
 
         def checked() -> Array:
@@ -202,7 +202,7 @@ class QuadraticTrust(eqx.Module):
         return Proposal(points, others, reduction, hessian, poor, check, rise, *said)
 
     def _solution(self, problem: tuple[Array, ...], center: Array, params: Params) -> Array:
-        """The minimiser within radius and bounds, or nothing where it is not wanted."""
+        """The minimiser within radius and bounds, or zero where it is not wanted."""
         wanted, hessian, grad, radius = problem
         solve = lambda: self._within_bounds(hessian, grad, radius, center, params)
         return jax.lax.cond(wanted, solve, lambda: jnp.zeros_like(grad))

@@ -32,7 +32,10 @@ class Sizes(NamedTuple):
 
 
 def where(condition: Bool[Array, ""], a: Any, b: Any) -> Any:
-    """One of two pytrees; what is the same in both, such as the history, is not copied."""
+    """One of two pytrees of the same shapes and dtypes.
+
+    What is the same in both, such as the history, is not copied.
+    """
     differ = jax.tree.map(lambda a, b: a is not b, a, b)
     (a, same), (b, _) = eqx.partition(a, differ), eqx.partition(b, differ)
     return eqx.combine(_either(condition, a, b), same)
@@ -40,7 +43,10 @@ def where(condition: Bool[Array, ""], a: Any, b: Any) -> Any:
 
 @jax.jit
 def _either(condition: Bool[Array, ""], a: PyTree[Array], b: PyTree[Array]) -> PyTree[Array]:
-    """By a branch: XLA would compute what leads to the condition anew for each array it chooses."""
+    """A branch chooses all arrays at once.
+
+    With a `jnp.where` for each, XLA computes anew for each what leads to the condition.
+    """
     return jax.lax.cond(condition, lambda: a, lambda: b)
 
 
