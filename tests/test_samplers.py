@@ -149,8 +149,8 @@ def test_without_the_file_of_scipy_its_sequence_is_asked(file, monkeypatch, tmp_
     np.testing.assert_array_equal(_directions.direction_numbers.__wrapped__(7, 5), numbers)
 
 
-def test_the_last_direction_numbers_are_odd():
-    """Number k is odd in units of its last digit, 2^-k."""
+def test_direction_number_k_is_odd_in_units_of_its_last_digit():
+    """Of all 32: for the last ones scipy would have to make 2^32 points."""
     numbers = _directions.direction_numbers(300, 32)
     assert numbers.shape == (32, 300)
     for k, row in enumerate(numbers):

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
 from smoothdiff._solvers._box import closed
-from smoothdiff._solvers._stages import where
+from smoothdiff._solvers._where import where
 
 # evaluations along a parameter: in the try of the first parameters, in a first scan, and the most
 _TRY, _FIRST, _MOST = 16, 50, 200

@@ -28,7 +28,8 @@ from smoothdiff._solvers._look import Look
 from smoothdiff._solvers._point_search import AbstractPointSearch
 from smoothdiff._solvers._random_numbers import in_step, takes_key
 from smoothdiff._solvers._ratio_test import is_lower, taken_by_rounding
-from smoothdiff._solvers._stages import Sizes, where
+from smoothdiff._solvers._stages import Sizes
+from smoothdiff._solvers._where import where
 
 # by default a search ends after so many evaluations for each parameter, and one, that hardly
 # lowered the function, but after no fewer steps than that

@@ -17,7 +17,8 @@ from smoothdiff._solvers._history import History, hardly_differ
 from smoothdiff._solvers._look import Look
 from smoothdiff._solvers._pilot import Pilot
 from smoothdiff._solvers._ratio_test import is_lower, is_noticeable
-from smoothdiff._solvers._stages import FIRST, LOOK, PILOT, TRUST, Sizes, where
+from smoothdiff._solvers._stages import FIRST, LOOK, PILOT, TRUST, Sizes
+from smoothdiff._solvers._where import where
 
 # so many small steps in a row count as convergence
 _SMALL = 3

@@ -36,7 +36,7 @@ from smoothdiff._solvers._ratio_test import (
     ratio_test,
     settled,
 )
-from smoothdiff._solvers._stages import where
+from smoothdiff._solvers._where import where
 
 # an evaluation so many radii away should make way for a nearer one
 _FAR = 2.0

@@ -13,7 +13,8 @@ from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._noisy_step import Trust, outcome, propose, revise
 from smoothdiff._solvers._point_search import nothing
 from smoothdiff._solvers._scalar_fit import ScalarFit, fit
-from smoothdiff._solvers._stages import Sizes, where
+from smoothdiff._solvers._stages import Sizes
+from smoothdiff._solvers._where import where
 
 # how strongly the noise of the Hessian's eigenvalues counts in the metric
 _CAUTION = 6.0

@@ -21,7 +21,8 @@ from smoothdiff._solvers._history import History, alike
 from smoothdiff._solvers._pilot import Pilot
 from smoothdiff._solvers._point_search import AbstractPointSearch
 from smoothdiff._solvers._residual_trust import Proposal, TrustRegion
-from smoothdiff._solvers._stages import FIRST, TRUST, WIDE, Sizes, by_stage, where
+from smoothdiff._solvers._stages import FIRST, TRUST, WIDE, Sizes, by_stage
+from smoothdiff._solvers._where import where
 from smoothdiff._solvers._wide_rounds import Wide, further, sides_of
 
 # evaluations of wide rounds since the last lower point, for each parameter, until the local model

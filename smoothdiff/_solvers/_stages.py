@@ -3,9 +3,8 @@
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
-from jaxtyping import Array, Bool, Int, PyTree
+from jaxtyping import Array, Int
 
 # what is evaluated next: the first points, a step of the local model, samples around a center,
 # points further and further away, points anywhere within the bounds, or along a parameter
@@ -29,25 +28,6 @@ class Sizes(NamedTuple):
         step = at_once or 1
         first, later = (-(-count // step) * step for count in (first, later))
         return Sizes(step, first, later, patience)
-
-
-def where(condition: Bool[Array, ""], a: Any, b: Any) -> Any:
-    """One of two pytrees of the same shapes and dtypes.
-
-    What is the same in both, such as the history, is not copied.
-    """
-    differ = jax.tree.map(lambda a, b: a is not b, a, b)
-    (a, same), (b, _) = eqx.partition(a, differ), eqx.partition(b, differ)
-    return eqx.combine(_either(condition, a, b), same)
-
-
-@jax.jit
-def _either(condition: Bool[Array, ""], a: PyTree[Array], b: PyTree[Array]) -> PyTree[Array]:
-    """A branch chooses all arrays at once.
-
-    With a `jnp.where` for each, XLA computes anew for each what leads to the condition.
-    """
-    return jax.lax.cond(condition, lambda: a, lambda: b)
 
 
 def by_stage(

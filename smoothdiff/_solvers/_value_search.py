@@ -23,9 +23,10 @@ from smoothdiff._solvers._judgement import differ
 from smoothdiff._solvers._parameter_scan import Scan
 from smoothdiff._solvers._quadratic_trust import Proposal
 from smoothdiff._solvers._ratio_test import are_level
-from smoothdiff._solvers._stages import FIRST, SCAN, TRUST, WIDE, Sizes, by_stage, where
+from smoothdiff._solvers._stages import FIRST, SCAN, TRUST, WIDE, Sizes, by_stage
 from smoothdiff._solvers._turns import Turn
 from smoothdiff._solvers._value_state import SIDES, ValueState
+from smoothdiff._solvers._where import where
 
 # a first search is long after so many evaluations for each parameter, and one
 _LONG = 60

@@ -17,8 +17,9 @@ from smoothdiff._solvers._point_search import AbstractPointSearch
 from smoothdiff._solvers._quadratic_trust import QuadraticTrust
 from smoothdiff._solvers._ratio_test import is_narrow, rounding_alone
 from smoothdiff._solvers._regression_step import Center
-from smoothdiff._solvers._stages import FIRST, SCAN, WIDE, Sizes, where
+from smoothdiff._solvers._stages import FIRST, SCAN, WIDE, Sizes
 from smoothdiff._solvers._turns import Turn
+from smoothdiff._solvers._where import where
 
 # of so many later searches one begins at the start
 _PATIENT = 4

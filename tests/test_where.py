@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from smoothdiff._solvers._stages import where
+from smoothdiff._solvers._where import where
 
 
 class State(NamedTuple):
