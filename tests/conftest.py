@@ -4,6 +4,7 @@ import collections
 import gc
 import math
 import multiprocessing
+import multiprocessing.forkserver
 import os
 import shutil
 import subprocess
@@ -109,6 +110,10 @@ def context():
     """Processes that have imported everything, and have not started JAX."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["killed_runs", "pasted"])
+    # until Python 3.13 the server does not know where this process looks for modules
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
+        multiprocessing.forkserver.ensure_running()
     return context
 
 
