@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from smoothdiff._flat import Flat
+from smoothdiff._packed import Packed
 from smoothdiff._programs import jit_quickly
 from smoothdiff._solvers._base import smoothed_params
 from smoothdiff._solvers._judgement import Contest
@@ -32,12 +33,14 @@ _SHORT = 1_000_000
 class HostSteps:
     """A solver that steps point by point, without a function.
 
-    In the solver and the options all that does not decide shapes is an array.
+    In the solver and the options all that does not decide shapes is an array. The `last` state is
+    packed once for all programs.
     """
 
     solver: Any
     options: dict[str, Any]
     sizes: Sizes
+    last: "_Last" = dataclasses.field(default_factory=lambda: _Last())
 
     @staticmethod
     def of(solver: Any, options: dict[str, Any], y: PyTree[Array]) -> "HostSteps":
@@ -77,8 +80,8 @@ class HostSteps:
         step, sizes = self._at(y, state), self._sizes(len(points))
         _, searched, counted = _compiled(state)
         after = searched(step, points, rows, proposal, sizes, int(state.search.stage))
-        new_y, new_state, over = counted(step, points, rows, after, sizes)
-        return new_y, new_state.tree(), over
+        new_y, packed, over = counted(step, points, rows, after, sizes)
+        return new_y, self.last.tree(packed), over
 
     def over(self, y: PyTree[Array], state: PointState) -> Bool[Array, ""]:
         """Whether the solver wants to stop before a step."""
@@ -115,11 +118,11 @@ class HostSteps:
         return PointStep(self.solver, self.sizes, y, self.options, state)
 
     @functools.cached_property
-    def _flat(self) -> Flat:
-        return Flat.of((self.solver, self.options))
+    def _fixed(self) -> Packed:
+        return Packed.of((self.solver, self.options))
 
-    def _at(self, y: PyTree[Array], state: PointState) -> tuple[Flat, PyTree, Flat]:
-        return self._flat, y, Flat.of(state)
+    def _at(self, y: PyTree[Array], state: PointState) -> tuple[Packed, PyTree, Packed]:
+        return self._fixed, y, self.last.packed(state)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # the structure of a module cannot be pickled
@@ -129,64 +132,84 @@ class HostSteps:
         return self.sizes if count is None else self.sizes._replace(step=count)
 
 
+class _Last:
+    """The last state as it went into a program or came out of it: most go into several."""
+
+    def __init__(self) -> None:
+        self._pair: tuple[Any, Any] = None, None
+
+    def packed(self, state: PointState) -> Packed:
+        """Packed anew, unless it is the same one."""
+        if self._pair[0] is not state:
+            self._pair = state, Packed.of(state)
+        return self._pair[1]
+
+    def tree(self, packed: Packed) -> PointState:
+        """The state, of which this is then known."""
+        self._pair = packed.tree(), packed
+        return self._pair[0]
+
+
 @jit_quickly
-def _first_state(flat: Flat) -> Flat:
+def _first_state(flat: Flat) -> Packed:
     solver, options, y, out = flat.tree()
     state = solver.init(None, y, None, options, out, None, frozenset())
     # weak types would compile the second step anew
-    return Flat.of(jax.tree.map(lambda a: jnp.asarray(a, a.dtype), state))
+    return Packed.of(jax.tree.map(lambda a: jnp.asarray(a, a.dtype), state))
 
 
-def _step_of(flat: tuple[Flat, PyTree, Flat], sizes: Sizes) -> PointStep:
+def _step_of(flat: tuple[Packed, PyTree, Packed], sizes: Sizes) -> PointStep:
     (solver, options), y, state = flat[0].tree(), flat[1], flat[2].tree()
     return PointStep(solver, sizes, y, options, state)
 
 
-def _propose(flat: tuple[Flat, PyTree, Flat], sizes: Sizes, stage: int) -> tuple[Array, Any]:
+def _propose(flat: tuple[Packed, PyTree, Packed], sizes: Sizes, stage: int) -> tuple[Array, Any]:
     return _step_of(flat, sizes).propose(stage)
 
 
 def _searched(
-    flat: tuple[Flat, PyTree, Flat],
+    flat: tuple[Packed, PyTree, Packed],
     points: Array,
     rows: Array,
     proposal: Any,
     sizes: Sizes,
     stage: int,
-) -> Flat:
-    return Flat.of(_step_of(flat, sizes).searched(points, rows, proposal, stage))
+) -> Packed:
+    return Packed.of(_step_of(flat, sizes).searched(points, rows, proposal, stage))
 
 
 def _counted(
-    flat: tuple[Flat, PyTree, Flat], points: Array, rows: Array, after: Flat, sizes: Sizes
-) -> tuple[PyTree, Flat, Bool[Array, ""]]:
+    flat: tuple[Packed, PyTree, Packed], points: Array, rows: Array, after: Packed, sizes: Sizes
+) -> tuple[PyTree, Packed, Bool[Array, ""]]:
     """Also whether the solver wants to stop there."""
     step = _step_of(flat, sizes)
     y, state = step.counted(points, rows, after.tree())
-    return y, Flat.of(state), dataclasses.replace(step, y=y, state=state).over()
+    return y, Packed.of(state), dataclasses.replace(step, y=y, state=state).over()
 
 
 # what is needed before and after the steps, and for what others have evaluated
 
 
 @functools.partial(jit_quickly, static_argnums=1)
-def _over(flat: tuple[Flat, PyTree, Flat], sizes: Sizes) -> Bool[Array, ""]:
+def _over(flat: tuple[Packed, PyTree, Packed], sizes: Sizes) -> Bool[Array, ""]:
     return _step_of(flat, sizes).over()
 
 
 @functools.partial(jit_quickly, static_argnums=3)
-def _learnt(flat: tuple[Flat, PyTree, Flat], points: Array, rows: Array, sizes: Sizes) -> Flat:
-    return Flat.of(_step_of(flat, sizes).learnt(points, rows))
+def _learnt(
+    flat: tuple[Packed, PyTree, Packed], points: Array, rows: Array, sizes: Sizes
+) -> Packed:
+    return Packed.of(_step_of(flat, sizes).learnt(points, rows))
 
 
 @functools.partial(jit_quickly, static_argnums=(1, 2))
-def _contest(flat: tuple[Flat, PyTree, Flat], sizes: Sizes, takes_key: bool) -> Flat:
+def _contest(flat: tuple[Packed, PyTree, Packed], sizes: Sizes, takes_key: bool) -> Flat:
     return Flat.of(_step_of(flat, sizes).contest(takes_key))
 
 
 @functools.partial(jit_quickly, static_argnums=1)
 def _decided(
-    flat: tuple[Flat, PyTree, Flat], sizes: Sizes, contest: Flat, done: Array, found: Array
+    flat: tuple[Packed, PyTree, Packed], sizes: Sizes, contest: Flat, done: Array, found: Array
 ) -> tuple[PyTree, dict[str, Array]]:
     return _step_of(flat, sizes).decided(contest.tree(), done, found)
 
