@@ -20,7 +20,7 @@ from smoothdiff._known import Known
 from smoothdiff._layout import Layout, layout_of
 from smoothdiff._problem import Problem, Trial
 from smoothdiff._programs import is_short, jit_quickly
-from smoothdiff._solvers._evaluator import Evaluator, objectives
+from smoothdiff._solvers._evaluator import Evaluator, objectives, row_of
 from smoothdiff._solvers._judgement import differ
 from smoothdiff._solvers._point_by_point import PointState
 from smoothdiff._solvers._random_numbers import in_round, takes_key
@@ -30,7 +30,8 @@ from smoothdiff._solvers._random_numbers import in_round, takes_key
 class HostProblem(Problem):
     """A problem whose solver steps point by point.
 
-    Its steps may be `moved` to a CPU from the device of the function.
+    Its steps may be `moved` to a CPU from the device of the function. The `first` point and its row
+    are known where an evaluation had to tell what a black box returns.
     """
 
     host: HostSteps
@@ -39,6 +40,7 @@ class HostProblem(Problem):
     device: Any
     moved: bool
     quick: bool = False
+    first: tuple[np.ndarray, Array] | None = None
 
     @staticmethod
     def of(
@@ -74,6 +76,17 @@ class HostProblem(Problem):
         with self.place():
             return dataclasses.replace(self, quick=quick), self.host.init(self.here(y), out)
 
+    def knowing(self, out: PyTree, y: PyTree, state: PointState) -> tuple[Problem, PointState]:
+        """The first step needs no other evaluation at y, unless it has other random numbers."""
+        shared = getattr(self.solver, "sharding", None) is not None
+        if takes_key(self.options) or shared or self.host.sizes.step > 1:
+            return super().knowing(out, y, state)
+        point = self.layout.vector(jax.tree.leaves(y))[None]
+        row = row_of(out, point.dtype)[None]
+        # where rows are in later steps, so that these go to the same program
+        row = brought(row) if self.moved else put_with(y, np.asarray(row))
+        return dataclasses.replace(self, first=(np.asarray(point), row)), state
+
     def stage(self, state: PointState) -> int:
         """That of the search."""
         return int(state.search.stage)
@@ -86,7 +99,9 @@ class HostProblem(Problem):
             numbers = self.host.parts(y, state).numbers(self.args)
             evaluate = Flat.of(dataclasses.replace(self._evaluator, args=numbers))
         before = 0 if self.known is None else self.known.answered
-        rows = self._rows(evaluate, points, len(points))
+        rows = self._first_row(points, state)
+        if rows is None:
+            rows = self._rows(evaluate, points, len(points))
         if self.solver.squares and int(state.progress.step) == 0:
             check_squares(np.asarray(rows)[0])
         y, state, over = self.host.told(y, state, points, rows, proposal)
@@ -157,6 +172,17 @@ class HostProblem(Problem):
         # points that are committed as in steps, so that they go to the same program
         rows = self._rows(evaluate, put_with(y, points), self.host.sizes.step, judging=True)
         return np.asarray(_objectives(rows, self.solver.squares))
+
+    def _first_row(self, points: Array, state: PointState) -> Array | None:
+        """What is known of the first point."""
+        if self.first is None or int(state.progress.step) > 0:
+            return None
+        point, row = self.first
+        if not np.array_equal(point, np.asarray(points)):
+            return None
+        if self.known is not None:
+            self.known.learn(points, row)
+        return row
 
     @functools.cached_property
     def _evaluator(self) -> Evaluator:

@@ -66,6 +66,11 @@ class Problem:
         # weak types would compile the second step anew
         return self, jax.tree.map(lambda a: jnp.asarray(a, a.dtype), state)
 
+    def knowing(self, out: PyTree, y: PyTree, state: Any) -> tuple["Problem", Any]:
+        """The problem and its first state, once an evaluation at y, which counts, returned that."""
+        count = state.progress.evaluations + 1
+        return self, eqx.tree_at(lambda s: s.progress.evaluations, state, count)
+
     def reason(self, state: Any) -> str:
         """One word for why it stops here, where `done` said so."""
         return self.solver.reason(state)

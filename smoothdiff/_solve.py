@@ -5,7 +5,6 @@ import os
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import optimistix as optx
 from jaxtyping import Array, PyTree
@@ -23,6 +22,7 @@ from smoothdiff._result import Record, Result
 from smoothdiff._run import Run, inexact
 from smoothdiff._solvers import AbstractSmoothSolver
 from smoothdiff._solvers._base import write_options
+from smoothdiff._solvers._evaluator import called
 from smoothdiff._solvers._random_numbers import keyed
 from smoothdiff._solvers._wrapped import Wrapped
 from smoothdiff._unit_space import UnitSpace
@@ -137,11 +137,10 @@ def _keeps(asked: bool | None, y: PyTree[Array]) -> bool:
 
 
 def _begun(problem: Problem, y: PyTree, check: Callable[[PyTree], None]) -> tuple[Problem, Any]:
-    """After an evaluation, which counts, if only that can tell what a black box returns."""
+    """After an evaluation, if only that can tell what a black box returns."""
     # the evaluation comes after this, so that what it raises has no other error beside it
     with contextlib.suppress(UnknownOutputError):
         return problem.begin(y, check)
-    problem.fun(y, problem.args)
+    out = called(problem.fun, y, problem.args)
     problem, state = problem.begin(y, check)
-    count = state.progress.evaluations
-    return problem, eqx.tree_at(lambda s: s.progress.evaluations, state, count + 1)
+    return problem.knowing(out, y, state)

@@ -125,7 +125,7 @@ def test_luck_that_is_known_is_seen_in_the_end():
     noise = lambda y: abs(y - 9) / 5 + 0.3 * numbers.standard_normal()
     fun = Counted(lambda y: 1.0 if y[0] < 6 else noise(y[0]))
     result = sd.minimise(sd.black_box(fun), 3, key=KEY, space=sd.Integer(0, 12))
-    assert result.evaluations == len(fun.points) > 2 * fun.distinct
+    assert result.evaluations == len(fun.points) >= 2 * fun.distinct
     assert result.fun > -0.3
 
 

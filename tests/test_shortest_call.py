@@ -352,3 +352,56 @@ def test_another_function_or_sigma_compiles_nothing_but_the_function(solver, com
 def test_wrong_arguments_are_told_what_to_write(call, error, match):
     with pytest.raises(error, match=match):
         call()
+
+
+# black boxes of which it is not known what they return
+
+
+class Seen:
+    """A host function that keeps its points."""
+
+    def __init__(self, value):
+        self.value, self.points = value, []
+
+    def __call__(self, y):
+        self.points.append(tuple(np.asarray(y).tolist()))
+        return self.value(np.asarray(y))
+
+
+RUNS = {
+    "one number": (sd.minimise, lambda y: np.float32(np.sum((y - 0.5) ** 2)), {}),
+    "residuals": (sd.least_squares, lambda y: (y**3 - 0.1).astype(np.float32), {}),
+    "residuals in a space": (
+        sd.least_squares,
+        lambda y: (y**3 - 0.1).astype(np.float32),
+        {"space": sd.Range(-2.0, 2.0)},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", quick_of(RUNS, ["residuals in a space"]))
+def test_the_evaluation_that_tells_what_a_box_returns_is_the_first_of_the_run(name):
+    call, value, where = RUNS[name]
+    y0, found = jnp.array([1.0, -1.5]), []
+    for out in (None, jax.eval_shape(lambda: jnp.asarray(value(np.ones(2, np.float32))))):
+        host = Seen(value)
+        box = sd.black_box(host, out=out)
+        result = call(lambda y, _: box(y), y0, key=KEY, max_evaluations=30, **where)  # noqa: B023
+        assert result.evaluations == len(host.points)
+        assert host.points[0] == tuple(y0.tolist()) != host.points[1]
+        found.append((host.points, result.fun, result.y))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "more", [{"solver": sd.NewtonCG(0.5, num_samples=3)}, {"takes_key": True}], ids=str
+)
+def test_a_batch_and_other_random_numbers_are_evaluated_at_the_start_as_well(more):
+    host = Seen(lambda y: np.float32(np.sum(y**2)))
+    box = sd.black_box(host)
+    fun = lambda y, args, key=None: box(y)
+    result = sd.minimise(fun, jnp.ones(2), key=KEY, max_evaluations=20, **more)
+    assert result.evaluations == len(host.points)
+    assert host.points.count((1.0, 1.0)) >= 2

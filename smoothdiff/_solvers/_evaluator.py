@@ -37,8 +37,7 @@ class Evaluator(eqx.Module):
 
         def row(x: Array) -> tuple[Array, PyTree]:
             out, aux = self.fn(self.layout.tree(x), self.args)
-            leaves = [jnp.ravel(leaf).astype(x.dtype) for leaf in jax.tree.leaves(out)]
-            return jnp.concatenate(leaves), aux
+            return row_of(out, x.dtype), aux
 
         if self.sharding is not None:
             rows, aux = jax.vmap(row)(shared_out(points, self.sharding))
@@ -68,6 +67,11 @@ def called(fun: Callable[[PyTree, Any], Any], y: PyTree[Array], args: PyTree) ->
     if [leaf.shape for leaf in leaves] != [()] or not jnp.issubdtype(leaves[0].dtype, jnp.integer):
         return out
     return jax.tree.map(lambda a: a.astype(layout_of(y).dtype), out)
+
+
+def row_of(out: PyTree[Array], dtype: Any) -> Float[Array, " P"]:
+    """What the function returned, as a vector."""
+    return jnp.concatenate([jnp.ravel(leaf).astype(dtype) for leaf in jax.tree.leaves(out)])
 
 
 def objectives(rows: Float[Array, "m P"], squares: bool) -> Float[Array, " m"]:
