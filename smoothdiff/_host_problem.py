@@ -8,6 +8,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
@@ -20,6 +21,7 @@ from smoothdiff._known import Known
 from smoothdiff._layout import Layout, layout_of
 from smoothdiff._problem import Problem, Trial
 from smoothdiff._programs import is_short, jit_quickly
+from smoothdiff._solvers import Progress
 from smoothdiff._solvers._evaluator import Evaluator, objectives, row_of
 from smoothdiff._solvers._judgement import differ
 from smoothdiff._solvers._point_by_point import PointState
@@ -77,15 +79,19 @@ class HostProblem(Problem):
             return dataclasses.replace(self, quick=quick), self.host.init(self.here(y), out)
 
     def knowing(self, out: PyTree, y: PyTree, state: PointState) -> tuple[Problem, PointState]:
-        """The first step needs no other evaluation at y, unless it has other random numbers."""
+        """A first step of this point alone, and of these random numbers, needs no other one."""
         shared = getattr(self.solver, "sharding", None) is not None
         if takes_key(self.options) or shared or self.host.sizes.step > 1:
             return super().knowing(out, y, state)
         point = self.layout.vector(jax.tree.leaves(y))[None]
         row = row_of(out, point.dtype)[None]
         # where rows are in later steps, so that these go to the same program
-        row = brought(row) if self.moved else put_with(y, np.asarray(row))
+        row = self.here(row) if self.moved else jnp.asarray(put_with(y, np.asarray(row)))
         return dataclasses.replace(self, first=(np.asarray(point), row)), state
+
+    def uncounted(self, progress: Progress) -> int:
+        """The first one, until a step has it."""
+        return int(self.first is not None and int(progress.step) == 0)
 
     def stage(self, state: PointState) -> int:
         """That of the search."""
@@ -159,7 +165,8 @@ class HostProblem(Problem):
                 if constant:
                     break
         y, stats = self.host.decided(y, state, contest, done, found)
-        return y, stats | {"evaluations": np.asarray(stats["evaluations"]) + constant}
+        more = constant + self.uncounted(state.progress)
+        return y, stats | {"evaluations": np.asarray(stats["evaluations"]) + more}
 
     def _funs(
         self, y: PyTree, points: Float[np.ndarray, "m n"], number: int

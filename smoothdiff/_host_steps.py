@@ -28,6 +28,27 @@ from smoothdiff._solvers._stages import Sizes
 _SHORT = 1_000_000
 
 
+class _Last:
+    """The last state as it went into a program or came out of it: most go into several."""
+
+    def __init__(self) -> None:
+        self._pair: tuple[Any, Any] = None, None
+
+    def packed(self, state: PointState) -> Packed:
+        """Packed anew, unless it is the same one."""
+        known, packed = self._pair
+        if known is not state:
+            packed = Packed.of(state)
+            self._pair = state, packed
+        return packed
+
+    def tree(self, packed: Packed) -> PointState:
+        """The state, of which this is then known."""
+        state = packed.tree()
+        self._pair = state, packed
+        return state
+
+
 # a call of a module's method makes a module, which takes a twentieth of a millisecond
 @dataclasses.dataclass(frozen=True, eq=False)
 class HostSteps:
@@ -40,7 +61,7 @@ class HostSteps:
     solver: Any
     options: dict[str, Any]
     sizes: Sizes
-    last: "_Last" = dataclasses.field(default_factory=lambda: _Last())
+    last: _Last = dataclasses.field(default_factory=_Last, init=False)
 
     @staticmethod
     def of(solver: Any, options: dict[str, Any], y: PyTree[Array]) -> "HostSteps":
@@ -59,7 +80,7 @@ class HostSteps:
 
     def init(self, y: PyTree[Array], out: PyTree[jax.ShapeDtypeStruct]) -> PointState:
         """The first state for a function that returns this."""
-        return _first_state(Flat.of((self.solver, self.options, y, out))).tree()
+        return self.last.tree(_first_state(Flat.of((self.solver, self.options, y, out))))
 
     def propose(
         self, y: PyTree[Array], state: PointState, count: int | None = None
@@ -95,7 +116,7 @@ class HostSteps:
         rows: Float[Array, "K P"],
     ) -> PointState:
         """The state with evaluations that it did not propose."""
-        return _learnt(self._at(y, state), points, rows, self.sizes).tree()
+        return self.last.tree(_learnt(self._at(y, state), points, rows, self.sizes))
 
     def contest(self, y: PyTree[Array], state: PointState, takes_key: bool = False) -> Contest:
         """The candidates for the answer, in NumPy's arrays."""
@@ -130,24 +151,6 @@ class HostSteps:
 
     def _sizes(self, count: int | None) -> Sizes:
         return self.sizes if count is None else self.sizes._replace(step=count)
-
-
-class _Last:
-    """The last state as it went into a program or came out of it: most go into several."""
-
-    def __init__(self) -> None:
-        self._pair: tuple[Any, Any] = None, None
-
-    def packed(self, state: PointState) -> Packed:
-        """Packed anew, unless it is the same one."""
-        if self._pair[0] is not state:
-            self._pair = state, Packed.of(state)
-        return self._pair[1]
-
-    def tree(self, packed: Packed) -> PointState:
-        """The state, of which this is then known."""
-        self._pair = packed.tree(), packed
-        return self._pair[0]
 
 
 @jit_quickly

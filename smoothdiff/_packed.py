@@ -20,8 +20,8 @@ from smoothdiff._params import is_concrete
 class Packed:
     """The scalars by dtype, the other arrays, and the rest, which is known when compiling."""
 
-    def __init__(self, scalars: tuple[Any, ...], flat: Flat, slots: tuple[Any, ...]) -> None:
-        self.scalars, self.flat, self.slots = scalars, flat, slots
+    def __init__(self, scalars: tuple[Any, ...], flat: Flat, rest: tuple[Any, ...]) -> None:
+        self.scalars, self.flat, self.rest = scalars, flat, rest
 
     @staticmethod
     def of(tree: PyTree) -> "Packed":
@@ -33,14 +33,12 @@ class Packed:
                 alike.setdefault(leaf.dtype, []).append(i)
         slots = tuple((dtype, tuple(at)) for dtype, at in alike.items())
         scalars = tuple(_joined([leaves[i] for i in at], dtype) for dtype, at in slots)
-        for i in (i for _, at in slots for i in at):
-            leaves[i] = None
-        flat = Flat.of(leaves)
+        flat = Flat.of([None if _is_scalar(leaf) else leaf for leaf in leaves])
         return Packed(scalars, flat, (treedef, slots))
 
     def tree(self) -> PyTree:
         """The pytree; outside of programs its scalars are NumPy's."""
-        treedef, slots = self.slots
+        treedef, slots = self.rest
         leaves = self.flat.tree()
         for (_, at), scalars in zip(slots, self.scalars, strict=True):
             scalars = np.asarray(scalars) if is_concrete(scalars) else scalars
@@ -50,13 +48,13 @@ class Packed:
 
     def tree_flatten(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """As JAX asks for it."""
-        return (self.scalars, self.flat), self.slots
+        return (self.scalars, self.flat), self.rest
 
     @classmethod
-    def tree_unflatten(cls, slots: tuple[Any, ...], parts: tuple[Any, ...]) -> "Packed":
+    def tree_unflatten(cls, rest: tuple[Any, ...], parts: tuple[Any, ...]) -> "Packed":
         """As JAX asks for it."""
         scalars, flat = parts
-        return cls(scalars, flat, slots)
+        return cls(scalars, flat, rest)
 
 
 def _is_scalar(leaf: Any) -> bool:

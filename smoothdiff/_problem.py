@@ -12,6 +12,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree
 
+from smoothdiff._solvers import Progress
 from smoothdiff._solvers._evaluator import called
 
 
@@ -70,6 +71,10 @@ class Problem:
         """The problem and its first state, once an evaluation at y, which counts, returned that."""
         count = state.progress.evaluations + 1
         return self, eqx.tree_at(lambda s: s.progress.evaluations, state, count)
+
+    def uncounted(self, progress: Progress) -> int:
+        """Evaluations that were made and are not among those of the state."""
+        return 0
 
     def reason(self, state: Any) -> str:
         """One word for why it stops here, where `done` said so."""

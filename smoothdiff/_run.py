@@ -221,7 +221,8 @@ class Run:
     def found(self, reason: str, progress: Progress | None = None) -> Result:
         """The result of a run that was cut short: no evaluation is made for it."""
         p = progress or self.state.progress
-        fun, evaluations, unknown = p.lowest_fun.item(), p.evaluations.item(), float("nan")
+        fun, unknown = p.lowest_fun.item(), float("nan")
+        evaluations = p.evaluations.item() + self.problem.uncounted(p)
         numbers = {"fun": fun, "smoothed": unknown, "stderr": unknown, "evaluations": evaluations}
         return self._result(p.lowest_y, reason, **numbers)
 
@@ -232,6 +233,7 @@ class Run:
             solver, state = solver.solver, state.state
         history = self.history[: self.steps]
         with self.problem.place():
+            y, state = jax.tree.map(_of_jax, (y, state))
             natural = self.units.natural(y)
         return Result(
             natural,
@@ -248,6 +250,11 @@ def inexact(leaf: Any) -> Array:
     leaf = jnp.asarray(leaf)
     # a dtype that is given is no weak type, for which everything would be compiled once more
     return leaf.astype(leaf.dtype if jnp.issubdtype(leaf.dtype, jnp.inexact) else float)
+
+
+def _of_jax(leaf: Any) -> Any:
+    """An array of NumPy's as one of JAX's."""
+    return jnp.asarray(leaf) if isinstance(leaf, np.ndarray | np.generic) else leaf
 
 
 def _unstack(records: Record) -> list[Record]:

@@ -65,7 +65,7 @@ for _ in range(20):
     points = search.ask(2)
     search.tell(points, [bowl(y, far) for y in points])
 assert search.fun < 1e-3
-assert search._state.search.stage.devices() == {cpu}
+assert search._state.search.history.points.devices() == {cpu}
 places.clear()
 result = sd.minimise(bowl, jax.device_put(start, cpu), 1.0, key=jax.random.key(0))
 assert places == {cpu} and result.fun < 1e-6  # who chose it has it

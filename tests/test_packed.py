@@ -31,7 +31,7 @@ def same(a, b):
             assert one == other
 
 
-def test_it_is_the_same_pytree_after_it():
+def test_a_pytree_comes_back_as_it_was():
     same(Packed.of(TREE).tree(), TREE)
     same(jax.jit(lambda packed: Packed.of(packed.tree()))(Packed.of(TREE)).tree(), TREE)
 

@@ -405,3 +405,50 @@ def test_a_batch_and_other_random_numbers_are_evaluated_at_the_start_as_well(mor
     result = sd.minimise(fun, jnp.ones(2), key=KEY, max_evaluations=20, **more)
     assert result.evaluations == len(host.points)
     assert host.points.count((1.0, 1.0)) >= 2
+
+
+def test_the_evaluation_that_tells_counts_where_no_step_follows():
+    host = Seen(lambda y: np.float32(np.sum(y**2)))
+    box = sd.black_box(host)
+    result = sd.minimise(lambda y, _: box(y), jnp.ones(2), key=KEY, max_steps=0)
+    assert result.evaluations == len(host.points)
+
+
+def test_what_a_run_leaves_is_jax_s():
+    """Scalars of its state are NumPy's while it runs."""
+
+    def interrupt(record):
+        raise KeyboardInterrupt
+
+    result = sd.minimise(lambda y, _: y**2, jnp.asarray(1.0), key=KEY, callback=interrupt)
+    assert result.reason == "interrupted"
+    arrays = [leaf for leaf in jax.tree.leaves((result.y, result.state)) if hasattr(leaf, "dtype")]
+    assert all(isinstance(array, jax.Array) for array in arrays)
+
+
+def test_a_first_value_that_is_not_finite_is_known_as_well():
+    host = Seen(lambda y: np.float32(np.nan if y[0] == 1 else np.sum(y**2)))
+    box = sd.black_box(host, on_nonfinite="nan")
+    solver = sd.NewtonCG(0.5, nonfinite="drop")
+    fun = lambda y, _: box(y)
+    result = sd.minimise(fun, jnp.ones(2), key=KEY, solver=solver, max_evaluations=30)
+    assert result.evaluations == len(host.points)
+    assert host.points[0] != host.points[1]
+    assert result.fun < 1
+
+
+@pytest.mark.slow
+def test_a_run_that_is_taken_up_goes_on_with_what_it_paid_for(tmp_path):
+    host = Seen(lambda y: (y**3 - 0.1).astype(np.float32))
+    options = {"key": KEY, "checkpoint": tmp_path / "run"}
+    for most in (10, 14):  # each time a new box: what it returns has to be told
+        box = sd.black_box(host)
+        host.points.clear()
+        result = sd.least_squares(
+            lambda y, _: box(y),  # noqa: B023
+            jnp.array([1.0, -1.5]),
+            max_evaluations=most,
+            **options,
+        )
+    assert 10 < result.evaluations <= 14
+    assert len(host.points) < 10
