@@ -117,7 +117,9 @@ class PointStep(eqx.Module):
 
     def params(self) -> Params:
         """The parameters with the solver's sigma."""
-        return smoothed_params(self.solver, self.y, self.state.progress.step, self.options)
+        return smoothed_params(
+            self.solver, self.y, jnp.asarray(self.state.progress.step), self.options
+        )
 
     def numbers(self, args: PyTree) -> PyTree:
         """The arguments of the function in this step."""
