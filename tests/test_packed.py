@@ -24,7 +24,7 @@ def same(a, b):
     for one, other in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         if isinstance(one, jax.Array | np.ndarray | np.generic):
             assert (one.shape, one.dtype) == (other.shape, other.dtype)
-            if jnp.issubdtype(one.dtype, jax.dtypes.prng_key):
+            if isinstance(one, jax.Array) and jnp.issubdtype(one.dtype, jax.dtypes.prng_key):
                 one, other = jax.random.key_data(one), jax.random.key_data(other)
             np.testing.assert_array_equal(one, other)
         else:
