@@ -43,7 +43,8 @@ class _Last:
         return packed
 
     def tree(self, packed: Packed) -> PointState:
-        """The state, of which this is then known."""
+        """The state, of which this is then known; its scalars are NumPy's, on no device."""
+        packed = packed.on_host()
         state = packed.tree()
         self._pair = state, packed
         return state

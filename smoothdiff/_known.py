@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from smoothdiff._devices import put_with
 from smoothdiff._layout import Layout, layout_of
 from smoothdiff._solvers._judgement import ROUNDING
 from smoothdiff._unit_space import UnitSpace
@@ -82,7 +83,8 @@ class Known:
         if new:
             rows = self.fresh(points[np.asarray(new)], evaluate)
             found = {names[i]: row for i, row in zip(new, np.asarray(rows), strict=True)}
-        return jnp.asarray(np.stack([found[n] if n in found else self._rows[n] for n in names]))
+        rows = np.stack([found[n] if n in found else self._rows[n] for n in names])
+        return jnp.asarray(put_with(points, rows))
 
     def fresh(
         self, points: Float[Array | np.ndarray, "K n"], evaluate: Evaluate

@@ -37,14 +37,17 @@ class Packed:
         return Packed(scalars, flat, (treedef, slots))
 
     def tree(self) -> PyTree:
-        """The pytree; outside of programs its scalars are NumPy's."""
+        """The pytree."""
         treedef, slots = self.rest
         leaves = self.flat.tree()
         for (_, at), scalars in zip(slots, self.scalars, strict=True):
-            scalars = np.asarray(scalars) if is_concrete(scalars) else scalars
             for k, i in enumerate(at):
                 leaves[i] = scalars[k, ...]
         return treedef.unflatten(leaves)
+
+    def on_host(self) -> "Packed":
+        """The same with scalars of NumPy's, which are on no device."""
+        return Packed(tuple(map(np.asarray, self.scalars)), self.flat, self.rest)
 
     def tree_flatten(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """As JAX asks for it."""

@@ -121,8 +121,8 @@ class Search:
     @property
     def y(self) -> PyTree:
         """The lowest point of those that were told; with `takes_key` the solver's iterate."""
-        lowest = jax.tree.map(jnp.asarray, self._state.progress.lowest_y)
-        return self._natural(self._y if self._takes_key else lowest)
+        y = self._y if self._takes_key else self._state.progress.lowest_y
+        return self._natural(jax.tree.map(jnp.asarray, y))
 
     @property
     def fun(self) -> float:

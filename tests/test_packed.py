@@ -1,4 +1,4 @@
-"""A pytree whose scalars are in one array for each dtype."""
+"""A pytree for programs: a tuple of its arrays, or one whose scalars are in few arrays."""
 
 import jax
 import jax.numpy as jnp
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import smoothdiff as sd
+from smoothdiff._flat import Flat
 from smoothdiff._packed import Packed
 
 TREE = {
@@ -17,6 +18,9 @@ TREE = {
     "solver": sd.NewtonCG(jnp.asarray(0.3)),
     "y": (jnp.ones(2), None, np.float32(np.inf)),
 }
+
+
+kinds = pytest.mark.parametrize("kind", [Flat, Packed])
 
 
 def same(a, b):
@@ -31,14 +35,22 @@ def same(a, b):
             assert one == other
 
 
-def test_a_pytree_comes_back_as_it_was():
-    same(Packed.of(TREE).tree(), TREE)
-    same(jax.jit(lambda packed: Packed.of(packed.tree()))(Packed.of(TREE)).tree(), TREE)
+@kinds
+def test_a_pytree_comes_back_as_it_was(kind):
+    same(kind.of(TREE).tree(), TREE)
+    same(jax.jit(lambda packed: kind.of(packed.tree()))(kind.of(TREE)).tree(), TREE)
 
 
+@kinds
 @pytest.mark.parametrize("tree", [{}, None, {"name": "drop"}, jnp.ones(2), jnp.ones(())], ids=str)
-def test_a_tree_may_have_no_scalars_or_nothing_else(tree):
-    same(Packed.of(tree).tree(), tree)
+def test_a_tree_may_have_no_scalars_or_nothing_else(kind, tree):
+    same(kind.of(tree).tree(), tree)
+
+
+@kinds
+def test_all_that_varies_is_an_array(kind):
+    leaves = jax.tree.leaves(kind.of(TREE))
+    assert all(isinstance(leaf, jax.Array | np.ndarray | np.generic) for leaf in leaves)
 
 
 def test_a_program_has_one_array_for_the_scalars_of_a_dtype():
@@ -47,30 +59,41 @@ def test_a_program_has_one_array_for_the_scalars_of_a_dtype():
     assert len(jax.tree.leaves(Packed.of(scalars | whole))) == 2
 
 
-def test_float64_is_kept(x64):
+def test_scalars_may_be_numpy_s():
+    packed = jax.jit(lambda packed: packed)(Packed.of(TREE))
+    on_host = packed.on_host()
+    same(on_host.tree(), TREE)
+    assert not isinstance(on_host.tree()["count"], jax.Array)
+    assert not any(isinstance(scalars, jax.Array) for scalars in on_host.scalars)
+
+
+@kinds
+def test_float64_is_kept(kind, x64):
     tree = {"a": jnp.asarray(1 / 3, jnp.float64), "b": jnp.asarray(1 / 3, jnp.float32)}
-    same(jax.jit(lambda packed: Packed.of(packed.tree()))(Packed.of(tree)).tree(), tree)
+    same(jax.jit(lambda packed: kind.of(packed.tree()))(kind.of(tree)).tree(), tree)
 
 
-def test_programs_are_compiled_once_for_the_same_rest():
+@kinds
+def test_programs_are_compiled_once_for_the_same_rest(kind):
     traces = []
 
     @jax.jit
     def step(packed):
         traces.append(packed)
         tree = packed.tree()
-        return Packed.of(tree | {"count": tree["count"] + 1})
+        return kind.of(tree | {"count": tree["count"] + 1})
 
-    once = step(Packed.of(TREE))
+    once = step(kind.of(TREE))
     for _ in range(2):
-        once = step(Packed.of(once.tree()))
+        once = step(kind.of(once.tree()))
     assert len(traces) == 1
     assert once.tree()["count"] == 6
-    step(Packed.of(TREE | {"name": "propagate"}))
+    step(kind.of(TREE | {"name": "propagate"}))
     assert len(traces) == 2
 
 
-def test_it_may_be_vmapped():
+@kinds
+def test_it_may_be_vmapped(kind):
     tree = {"a": jnp.arange(3.0), "b": jnp.arange(3, dtype=jnp.int32)}
-    double = lambda tree: jax.tree.map(lambda a: 2 * a, Packed.of(tree).tree())
+    double = lambda tree: jax.tree.map(lambda a: 2 * a, kind.of(tree).tree())
     same(jax.vmap(double)(tree), double(tree))

@@ -299,6 +299,25 @@ def test_another_function_or_sigma_compiles_nothing_but_the_function(solver, com
     assert len(traced) <= 2 * before
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("space", [None, sd.Integer(-9, 9)], ids=["numbers", "whole"])
+def test_a_start_on_a_chosen_device_compiles_no_step_twice(space, caplog):
+    caplog.set_level(logging.WARNING)
+
+    def parts(device):
+        jax.clear_caches()
+        caplog.clear()
+        start = jax.device_put(jnp.ones(3, jnp.float32 if space is None else jnp.int32), device)
+        fun = lambda y, _: jnp.sum((y - 2).astype(jnp.float32) ** 2)
+        with jax.log_compiles():
+            sd.minimise(fun, start, key=KEY, space=space, max_evaluations=40)
+        messages = [record.getMessage() for record in caplog.records]
+        programs = [line.split()[1] for line in messages if line.startswith("Compiling")]
+        return sorted(name for name in programs if name.startswith("jit(_"))
+
+    assert parts(jax.devices()[0]) == parts(None)
+
+
 # what is told
 
 

@@ -117,9 +117,8 @@ class PointStep(eqx.Module):
 
     def params(self) -> Params:
         """The parameters with the solver's sigma."""
-        return smoothed_params(
-            self.solver, self.y, jnp.asarray(self.state.progress.step), self.options
-        )
+        step = jnp.asarray(self.state.progress.step)  # on the host it is NumPy's
+        return smoothed_params(self.solver, self.y, step, self.options)
 
     def numbers(self, args: PyTree) -> PyTree:
         """The arguments of the function in this step."""
