@@ -51,6 +51,19 @@ def test_a_poor_minimum_is_left(case, seed):
     np.testing.assert_allclose(left.y, BASIN, atol=1e-3)
 
 
+@pytest.mark.parametrize("seed", quick_of(range(5), [0]))
+def test_a_minimum_with_a_kink_is_left(seed):
+    """Wide samples around it find nothing: the look comes before they have become narrow."""
+
+    def fun(y, args):
+        kink = 0.3 + jnp.sum(jnp.abs(y - 0.8))
+        return jnp.where(jnp.all(y > 0.6), kink, jnp.sum(jnp.abs(y - BASIN)))
+
+    start, key = jnp.array([0.7, 0.75]), jax.random.key(seed)
+    left = sd.minimise(fun, start, key=key, bounds=(LOW, HIGH))
+    np.testing.assert_allclose(left.y, BASIN, atol=1e-3)
+
+
 @pytest.mark.slow
 @each
 def test_it_is_left_under_optimistix_too(call, solver, fun):

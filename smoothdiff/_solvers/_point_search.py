@@ -251,16 +251,22 @@ class AbstractPointSearch(eqx.Module):
     def looking(self, params: Params, sizes: Sizes, least: Bool[Array, ""]) -> Any:
         """With a look over all of the box next, if the search would end; not at the `least`.
 
+        Before wide samples as well, where a local model is of no use any more: they take long.
         Or with one further on, if it may have run off.
         """
         if (look := self.look) is None:
             return self
-        ended = (self.converged() | self.over(sizes)) & ~look.done & ~self.is_looking()
+        ended = self.converged() | self.over(sizes) | (has_box(params) & self.at_kink())
+        ended &= ~look.done & ~self.is_looking()
         starts = ended & ~least & ~self.is_good() & (has_box(params) | self.may_run_off(params))
         stage = jnp.where(starts, LOOK, self.stage).astype(self.stage.dtype)
         begun = look.begun(self.history.best(self.start)[2], self.stage)
         done = eqx.tree_at(lambda k: k.done, look, look.done | ended | least)
         return eqx.tree_at(lambda s: (s.stage, s.look), self, (stage, where(starts, begun, done)))
+
+    def at_kink(self) -> Bool[Array, ""]:
+        """Whether it is in a minimum that no local model describes."""
+        return jnp.asarray(False)
 
     def is_good(self) -> Bool[Array, ""]:
         """Whether the lowest point is so low that no look is needed."""

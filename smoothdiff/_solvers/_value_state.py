@@ -186,6 +186,10 @@ class ValueState(AbstractPointSearch):
             return jnp.asarray(False)
         return self.converged() & look.is_far(params, self.history.best(self.start)[0])
 
+    def at_kink(self) -> Bool[Array, ""]:
+        """The local model has come down to nothing, and wide samples alone go on."""
+        return (self.stage == WIDE) & self.trust.failed() & ~self.noisy
+
     def settled(self) -> Bool[Array, ""]:
         """The local model's may be none."""
         return ~self.is_local() | self.trust.settled
