@@ -187,8 +187,9 @@ class ValueState(AbstractPointSearch):
         return self.converged() & look.is_far(params, self.history.best(self.start)[0])
 
     def at_kink(self) -> Bool[Array, ""]:
-        """The local model has come down to nothing, and wide samples alone go on."""
-        return (self.stage == WIDE) & self.trust.failed() & ~self.noisy
+        """The local model is of no use any more, wide samples go on, and there is no noise."""
+        tells = ~self.noisy & ~self.checks_noise()
+        return (self.stage == WIDE) & self.trust.failed() & tells
 
     def settled(self) -> Bool[Array, ""]:
         """The local model's may be none."""
