@@ -1,4 +1,4 @@
-"""Before a search ends within bounds it looks elsewhere: what is found there, and what it costs."""
+"""Within bounds a search looks elsewhere once: what is found there, and what it costs."""
 
 import jax
 import jax.numpy as jnp
@@ -53,15 +53,32 @@ def test_a_poor_minimum_is_left(case, seed):
 
 @pytest.mark.parametrize("seed", quick_of(range(5), [0]))
 def test_a_minimum_with_a_kink_is_left(seed):
-    """Wide samples around it find nothing: the look comes before they have become narrow."""
+    """Wide samples around it find nothing: the look comes while they still go on."""
 
     def fun(y, args):
-        kink = 0.3 + jnp.sum(jnp.abs(y - 0.8))
+        # half of the box is lower than the kink
+        kink = 0.5 + jnp.sum(jnp.abs(y - 0.8))
         return jnp.where(jnp.all(y > 0.6), kink, jnp.sum(jnp.abs(y - BASIN)))
 
     start, key = jnp.array([0.7, 0.75]), jax.random.key(seed)
     left = sd.minimise(fun, start, key=key, bounds=(LOW, HIGH))
     np.testing.assert_allclose(left.y, BASIN, atol=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [2, 3])
+def test_a_look_that_finds_nothing_breaks_into_no_round(seed):
+    """Several points of a round are asked for at once: after the look none comes again."""
+    ripples = lambda y: np.sum(4 * (y - 0.3) ** 2 + 0.2 * (1 - np.cos(25 * (y - 0.3))))
+    start = np.random.default_rng(seed).random(2)
+    search = sd.Search(start, key=jax.random.key(seed), bounds=(LOW, HIGH))
+    asked = []
+    while not search.done and len(asked) < 200:
+        points = [np.asarray(point) for point in search.ask(4)]
+        search.tell(points, [ripples(point) for point in points])
+        asked += points
+    # one alone, to see whether the function has noise
+    assert len(asked) - len(np.unique(asked, axis=0)) <= 1
 
 
 @pytest.mark.slow

@@ -1,6 +1,6 @@
-"""A look over the whole box of the bounds, or further on, before a search ends.
+"""A look over the whole box of the bounds, or further on, where a search has little left to do.
 
-A search knows a neighbourhood. Where it ends in a minimum of little depth, a few points anywhere
+A search knows a neighbourhood. Where it is in a minimum of little depth, a few points anywhere
 are mostly lower; where it found a good one, they cost no more than a first quadratic model.
 
 Where there is no box a search may run off. So far from the start that steps beside the distance are

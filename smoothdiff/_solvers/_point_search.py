@@ -34,7 +34,7 @@ class AbstractPointSearch(eqx.Module):
     """Where a search stands: all that was evaluated, and what comes next.
 
     It begins with the `first` points. Where they hardly differ, the `pilot` follows, and the first
-    points again if it found something else. There may be a `look` before the end.
+    points again if it found something else. There may be one `look`.
 
     `evaluated` counts the evaluations, `small` the small steps in a row. The `mark` is the lowest
     value when it last fell noticeably, and `stale` counts the evaluations since.
@@ -249,24 +249,22 @@ class AbstractPointSearch(eqx.Module):
         return where(pilot.length > 0, widened, more)
 
     def looking(self, params: Params, sizes: Sizes, least: Bool[Array, ""]) -> Any:
-        """With a look over all of the box next, if the search would end; not at the `least`.
+        """With a look over all of the box next, if one is due; not at the `least`.
 
-        Before wide samples as well, where a local model is of no use any more: they take long.
         Or with one further on, if it may have run off.
         """
         if (look := self.look) is None:
             return self
-        ended = self.converged() | self.over(sizes) | (has_box(params) & self.at_kink())
-        ended &= ~look.done & ~self.is_looking()
-        starts = ended & ~least & ~self.is_good() & (has_box(params) | self.may_run_off(params))
+        due = self.look_due(params, sizes) & ~look.done & ~self.is_looking()
+        starts = due & ~least & ~self.is_good() & (has_box(params) | self.may_run_off(params))
         stage = jnp.where(starts, LOOK, self.stage).astype(self.stage.dtype)
         begun = look.begun(self.history.best(self.start)[2], self.stage)
-        done = eqx.tree_at(lambda k: k.done, look, look.done | ended | least)
+        done = eqx.tree_at(lambda k: k.done, look, look.done | due | least)
         return eqx.tree_at(lambda s: (s.stage, s.look), self, (stage, where(starts, begun, done)))
 
-    def at_kink(self) -> Bool[Array, ""]:
-        """Whether it is in a minimum that no local model describes."""
-        return jnp.asarray(False)
+    def look_due(self, params: Params, sizes: Sizes) -> Bool[Array, ""]:
+        """Whether the search would end."""
+        return self.converged() | self.over(sizes)
 
     def is_good(self) -> Bool[Array, ""]:
         """Whether the lowest point is so low that no look is needed."""

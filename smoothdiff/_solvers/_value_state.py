@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
+from smoothdiff._solvers._box import has_box
 from smoothdiff._solvers._first_points import FARTHER, NEARER, FirstPoints
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._metric import Metric
@@ -186,10 +187,14 @@ class ValueState(AbstractPointSearch):
             return jnp.asarray(False)
         return self.converged() & look.is_far(params, self.history.best(self.start)[0])
 
-    def at_kink(self) -> Bool[Array, ""]:
-        """The local model is of no use any more, wide samples go on, and there is no noise."""
-        tells = ~self.noisy & ~self.checks_noise()
-        return (self.stage == WIDE) & self.trust.failed() & tells
+    def look_due(self, params: Params, sizes: Sizes) -> Bool[Array, ""]:
+        """Also between rounds, once the local model has failed: wide samples alone take long.
+
+        Where the function has noise they go on, as before the first round nobody knows.
+        """
+        between = (self.stage == WIDE) & (self.rounds > 0) & (self.taken == 0)
+        alone = has_box(params) & between & self.trust.failed() & ~self.noisy
+        return super().look_due(params, sizes) | alone
 
     def settled(self) -> Bool[Array, ""]:
         """The local model's may be none."""
