@@ -1,4 +1,4 @@
-"""A pytree for programs: a tuple of its arrays, or one whose scalars are in few arrays."""
+"""`Flat` and `Packed`: a pytree as programs take it."""
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +18,6 @@ TREE = {
     "solver": sd.NewtonCG(jnp.asarray(0.3)),
     "y": (jnp.ones(2), None, np.float32(np.inf)),
 }
-
-
 kinds = pytest.mark.parametrize("kind", [Flat, Packed])
 
 
