@@ -4,7 +4,8 @@ The function is evaluated at the start and one sigma from it along each paramete
 that is far too long. Then a model of the residuals around the best point says where to evaluate
 next, while it predicts what comes. Where its steps fail in a row, or most residuals do not move, a
 wide regression takes over: rounds of samples around a center, which may go uphill, until its steps
-come true or have led to nothing.
+come true or have led to nothing. While they lead to something, the local model is tested now and
+then, and stays if it lowers the loss faster.
 """
 
 import dataclasses
@@ -22,6 +23,7 @@ from smoothdiff._solvers._pilot import Pilot
 from smoothdiff._solvers._point_search import AbstractPointSearch
 from smoothdiff._solvers._residual_trust import Proposal, TrustRegion
 from smoothdiff._solvers._stages import FIRST, TRUST, WIDE, Sizes, by_stage
+from smoothdiff._solvers._turns import Turn
 from smoothdiff._solvers._where import where
 from smoothdiff._solvers._wide_rounds import Wide, further, sides_of
 
@@ -41,6 +43,7 @@ class ResidualSearch(AbstractPointSearch):
 
     trust: TrustRegion
     wide: Wide
+    turn: Turn
 
     @staticmethod
     def of(theta: Float[Array, " n"], history: History) -> "ResidualSearch":
@@ -55,6 +58,7 @@ class ResidualSearch(AbstractPointSearch):
             first=FirstPoints.start(theta),
             trust=TrustRegion.start(one, n, size),
             wide=Wide.start(theta, jnp.zeros(size, theta.dtype), jnp.ones_like(theta)),
+            turn=Turn.start(n, one),
             small=none,
             stale=none,
             mark=jnp.full_like(one, jnp.inf),
@@ -208,7 +212,7 @@ class ResidualSearch(AbstractPointSearch):
             lambda: with_rows._after_first(
                 params, jnp.where(new.valid, new.funs, jnp.inf)
             ).piloting(params),
-            lambda: with_rows._after_local(here[1], new.rows, new.valid, proposal),
+            lambda: with_rows._after_local(here[1], new.rows, new.valid, proposal, sizes),
             lambda: with_rows._after_wide(params, new.rows, new.valid, sizes),
             lambda: with_rows.piloted(params, new),
         ]
@@ -217,14 +221,14 @@ class ResidualSearch(AbstractPointSearch):
         return by_stage(self.stage, stage, branches)
 
     def _to_wide(self, scale: Array) -> "ResidualSearch":
-        center, row, _ = self.history.best(self.start)
+        center, row, fun = self.history.best(self.start)
         wide = Wide.start(center, row, scale)
         # the center is known: the samples begin at once
         wide = eqx.tree_at(
             lambda w: (w.taken, w.rounds), wide, (jnp.ones_like(wide.taken), self.wide.rounds + 1)
         )
-        stage = jnp.full_like(self.stage, WIDE)
-        return eqx.tree_at(lambda s: (s.stage, s.wide), self, (stage, wide))
+        stage, turn = jnp.full_like(self.stage, WIDE), Turn.start(len(center), fun)
+        return eqx.tree_at(lambda s: (s.stage, s.wide, s.turn), self, (stage, wide, turn))
 
     def _after_first(self, params: Params, funs: Float[Array, " K"]) -> "ResidualSearch":
         sides = [jnp.abs(s) for s in sides_of(params, self.start) if s is not None]
@@ -240,44 +244,37 @@ class ResidualSearch(AbstractPointSearch):
         return where(first.done() & few, known._to_wide(jnp.ones_like(self.wide.scale)), known)
 
     def _after_local(
-        self, row: Array, rows: Array, good: Array, proposal: Proposal
+        self, row: Array, rows: Array, good: Array, proposal: Proposal, sizes: Sizes
     ) -> "ResidualSearch":
         trust = self.trust.revise(proposal, row, rows, good, compared=self.average is None)
-        local = eqx.tree_at(lambda s: s.trust, self, trust)
-        wide = self.wide
+        changed = trust, self.turn.more(sizes.step)
+        local = eqx.tree_at(lambda s: (s.trust, s.turn), self, changed)
+        wide, failed = self.wide, trust.failed()
         vain = (wide.rounds > 0) & (wide.true < _TRUE)
         scale = jnp.where(vain, _VAIN * wide.scale, jnp.maximum(wide.scale, 1))
-        return where(trust.failed(), local._to_wide(scale), local)
+        after = where(failed, local._to_wide(scale), local)
+        # where a test was lost, wide rounds go on as they were
+        ended = self.turn.test & (local.turn.over() | failed)
+        turn, lost = local._next_turn(failed)
+        tested = dataclasses.replace(local, turn=turn)
+        changed = jnp.full_like(self.stage, WIDE), jnp.zeros_like(wide.idle)
+        resumed = eqx.tree_at(lambda s: (s.stage, s.wide.idle), tested, changed)
+        return where(ended, where(lost, resumed, tested), after)
 
     def _after_wide(
         self, params: Params, rows: Array, good: Array, sizes: Sizes
     ) -> "ResidualSearch":
-        wide, first = self.wide, self.wide.taken == 0
-        wanted = jnp.where(wide.seen, sizes.later, sizes.first)
-        fun = jnp.where(good[0], jnp.sum(rows[0] ** 2) / 2, jnp.inf)
-        _, lowest, _ = self.history.best(self.start)
-        near = jnp.max(jnp.abs(wide.move / (params.sigma * wide.scale))) < 1
-        held = (fun < wide.before / 2) & (fun <= jnp.sum(lowest**2) / 2) & near
-        true = jnp.where(first, jnp.where(held, wide.true + 1, 0), wide.true)
-        before = jnp.where(first, fun, wide.before)
-        row = jnp.where(first, jnp.where(good[0], rows[0], jnp.inf), wide.row)
-        taken = wide.taken + sizes.step
-        newest = self.history.rows[-sizes.step :]
-        lower = jnp.any(jnp.all(newest == lowest[None], axis=1) & good)
-        idle = jnp.where(lower, 0, wide.idle + sizes.step)
-        found = wide.found | lower
-        wide = eqx.tree_at(
-            lambda w: (w.true, w.before, w.row, w.taken, w.idle, w.found),
-            wide,
-            (true, before, row, taken, idle, found),
-        )
-        average, full = self.average, taken >= wanted
+        _, lowest, fun = self.history.best(self.start)
+        wanted = jnp.where(self.wide.seen, sizes.later, sizes.first)
+        wide = self.wide.sampled(params, self.history, lowest, rows, good)
+        average, full = self.average, wide.taken >= wanted
         moved = lambda: wide.stepped(self.history, params, wanted, takes_key=average is not None)
         wide = jax.lax.cond(full, moved, lambda: wide)
-        search = eqx.tree_at(lambda s: s.wide, self, wide)
+        changed = wide, self.turn.more(sizes.step)
+        search = eqx.tree_at(lambda s: (s.wide, s.turn), self, changed)
         if average is not None:
             return search.with_mean(where(full, average.after(wide.center), average))
-        came_true = true >= _TRUE
+        came_true, n = wide.true >= _TRUE, len(self.start)
         # the local model begins anew around what was found, or goes on
         radius = jnp.where(
             came_true,
@@ -286,7 +283,17 @@ class ResidualSearch(AbstractPointSearch):
         )
         radius = jnp.maximum(jnp.asarray(radius), jnp.finfo(fun.dtype).eps)
         anew = TrustRegion.start(jnp.asarray(radius), *self.trust.jacobian.shape)
-        trust = where(came_true | found, anew, self.trust.resumed())
-        stage = jnp.full_like(self.stage, TRUST)
-        back = eqx.tree_at(lambda s: (s.stage, s.trust), self, (stage, trust))
-        return where(came_true | (idle >= _IDLE * (len(self.start) + 1)), back, search)
+        trust = where(came_true | wide.found, anew, self.trust.resumed())
+        ended = came_true | (wide.idle >= _IDLE * (n + 1))
+        # or it shows between rounds whether it is faster
+        lower, _ = search.turn.lowered(fun)
+        tests = full & search.turn.over() & lower
+        turn = where(ended, Turn.start(n, fun), search._next_turn(jnp.asarray(False))[0])
+        changed = jnp.full_like(self.stage, TRUST), trust, turn
+        back = eqx.tree_at(lambda s: (s.stage, s.trust, s.turn), search, changed)
+        return where(ended | tests, back, search)
+
+    def _next_turn(self, failed: Bool[Array, ""]) -> tuple[Turn, Bool[Array, ""]]:
+        """The turn after this one, and whether the other model has it."""
+        no, fun = jnp.asarray(False), self.history.best(self.start)[2]
+        return self.turn.next(fun, len(self.start), (failed, no), no)

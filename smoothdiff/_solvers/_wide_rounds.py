@@ -54,6 +54,29 @@ class Wide(eqx.Module):
         no = jnp.asarray(False)
         return Wide(center, row, still, scale, before, none, none, none, none, no, no)
 
+    def sampled(
+        self, params: Params, history: History, lowest: Array, rows: Array, good: Array
+    ) -> "Wide":
+        """With these residuals, the newest of the history, in which the `lowest` ones are."""
+        first, fun = self.taken == 0, jnp.where(good[0], jnp.sum(rows[0] ** 2) / 2, jnp.inf)
+        near = jnp.max(jnp.abs(self.move / (params.sigma * self.scale))) < 1
+        held = (fun < self.before / 2) & (fun <= jnp.sum(lowest**2) / 2) & near
+        newest = history.rows[-len(rows) :]
+        lower = jnp.any(jnp.all(newest == lowest[None], axis=1) & good)
+        return Wide(
+            center=self.center,
+            row=jnp.where(first, jnp.where(good[0], rows[0], jnp.inf), self.row),
+            move=self.move,
+            scale=self.scale,
+            before=jnp.where(first, fun, self.before),
+            taken=self.taken + len(rows),
+            rounds=self.rounds,
+            true=jnp.where(first, jnp.where(held, self.true + 1, 0), self.true),
+            idle=jnp.where(lower, 0, self.idle + len(rows)),
+            found=self.found | lower,
+            seen=self.seen,
+        )
+
     def stepped(
         self, history: History, params: Params, count: Array, takes_key: bool = False
     ) -> "Wide":

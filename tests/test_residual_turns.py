@@ -1,0 +1,72 @@
+"""Wide rounds and the local model of residuals take turns: which goes on, and where."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import smoothdiff as sd
+from smoothdiff._solvers._stages import TRUST, WIDE
+from tests.parts import quick_of
+
+TIMES = np.linspace(0, 1, 50)
+LOW, HIGH = np.array([0.2, 1, 0, 0.2, 1]), np.array([2, 12, 6.3, 2, 12])
+TRUE = np.array([1, 7, 1, 0.6, 5])
+
+
+def waves(y):
+    """Smooth, but beyond half a wave a linear model says nothing."""
+    fast = y[0] * np.sin(y[1] * TIMES + y[2])
+    return fast + y[3] * np.cos(y[4] * TIMES**2)
+
+
+@pytest.mark.parametrize("seed", quick_of([5, 6, 8, 10], [8]))
+def test_on_a_smooth_function_the_local_model_comes_back(seed):
+    """From these starts it fails first; wide rounds find lower points for long."""
+    left = []
+
+    def residuals(y):
+        left.append(np.sum((waves(y) - waves(TRUE)) ** 2))
+        return (waves(y) - waves(TRUE)).astype(np.float32)
+
+    box = sd.black_box(residuals, jax.ShapeDtypeStruct(TIMES.shape, jnp.float32))
+    start = LOW + (HIGH - LOW) * np.random.default_rng(seed).random(5)
+    bounds = jnp.asarray(LOW, jnp.float32), jnp.asarray(HIGH, jnp.float32)
+    found = sd.least_squares(
+        lambda y, args: box(y),
+        jnp.asarray(start, jnp.float32),
+        bounds=bounds,
+        key=jax.random.key(seed),
+    )
+    assert found.reason == "converged"
+    assert np.argmax(np.array(left) < 1e-6 * left[0]) < 15 * (5 + 1)
+    np.testing.assert_allclose(found.y, TRUE, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_where_a_function_jumps_wide_rounds_go_on_where_they_were():
+    grid = (np.arange(16) + 0.5) / 16
+    across, down = np.meshgrid(grid, grid)
+
+    def image(y):
+        discs = np.reshape(y, (3, 3))
+        return sum((across - a) ** 2 + (down - b) ** 2 < (0.1 + r / 5) ** 2 for a, b, r in discs)
+
+    true = np.array([0.3, 0.3, 0.3, 0.7, 0.6, 0.6, 0.25, 0.75, 0.1])
+    start = jnp.asarray(np.random.default_rng(0).random(9), jnp.float32)
+    settings = {"key": jax.random.key(0), "bounds": (jnp.zeros(9), jnp.ones(9))}
+    search, lost = sd.Search(start, residuals=True, **settings), 0
+    for _ in range(300):
+        before = search._state.search
+        points = search.ask(1)
+        search.tell(points, [(image(p) - image(true)).astype(np.float32) for p in points])
+        after = search._state.search
+        if before.stage == WIDE and after.stage == TRUST:
+            left = after
+        if before.turn.test and after.stage == WIDE:
+            lost += 1
+            np.testing.assert_array_equal(after.wide.center, left.wide.center)
+            np.testing.assert_array_equal(after.wide.scale, left.wide.scale)
+            assert after.turn.length == 2 * left.turn.usual
+            assert after.evaluated - left.evaluated <= left.turn.length
+    assert lost > 0
