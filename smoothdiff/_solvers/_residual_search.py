@@ -30,6 +30,8 @@ from smoothdiff._solvers._wide_rounds import Wide, further, sides_of
 # evaluations of wide rounds since the last lower point, for each parameter, until the local model
 # goes on: around a lower point that they found with a radius of so many widths, else as it was
 _IDLE, _NARROWER = 6, 0.1
+# ... which is tested before, once they are so narrow, in sigma: wider ones are to find the valley
+_NARROW = 0.3
 # rounds that came to nothing are so much narrower when they are tried again
 _VAIN = 0.5
 # so much of the loss at the start is much, where a search should end
@@ -287,7 +289,8 @@ class ResidualSearch(AbstractPointSearch):
         ended = came_true | (wide.idle >= _IDLE * (n + 1))
         # or it shows between rounds whether it is faster
         lower, _ = search.turn.lowered(fun)
-        tests = full & search.turn.over() & lower
+        narrow = jnp.sqrt(jnp.mean(wide.scale**2)) < _NARROW
+        tests = full & search.turn.over() & lower & narrow
         turn = where(ended, Turn.start(n, fun), search._next_turn(jnp.asarray(False))[0])
         changed = jnp.full_like(self.stage, TRUST), trust, turn
         back = eqx.tree_at(lambda s: (s.stage, s.trust, s.turn), search, changed)
