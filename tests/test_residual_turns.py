@@ -39,7 +39,8 @@ def test_on_a_smooth_function_the_local_model_comes_back(seed):
         key=jax.random.key(seed),
     )
     assert found.reason == "converged"
-    assert np.argmax(np.array(left) < 1e-6 * left[0]) < 15 * (5 + 1)
+    solved = np.flatnonzero(np.array(left) < 1e-6 * left[0])
+    assert solved[0] < 15 * (5 + 1)
     np.testing.assert_allclose(found.y, TRUE, atol=1e-3)
 
 
@@ -67,6 +68,7 @@ def test_where_a_function_jumps_wide_rounds_go_on_where_they_were():
             lost += 1
             np.testing.assert_array_equal(after.wide.center, left.wide.center)
             np.testing.assert_array_equal(after.wide.scale, left.wide.scale)
-            assert after.turn.length == 2 * left.turn.usual
+            slow = after.turn.rate <= 0.3 * before.turn.rate
+            assert after.turn.length == (2 * left.turn.usual if slow else 6 * (9 + 1))
             assert after.evaluated - left.evaluated <= left.turn.length
     assert lost > 0

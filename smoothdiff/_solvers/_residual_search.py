@@ -5,7 +5,7 @@ that is far too long. Then a model of the residuals around the best point says w
 next, while it predicts what comes. Where its steps fail in a row, or most residuals do not move, a
 wide regression takes over: rounds of samples around a center, which may go uphill, until its steps
 come true or have led to nothing. While they lead to something, the local model is tested now and
-then, and stays if it lowers the loss faster.
+then, and stays if it is about as fast.
 """
 
 import dataclasses
@@ -32,7 +32,8 @@ from smoothdiff._solvers._wide_rounds import Wide, further, sides_of
 _IDLE, _NARROWER = 6, 0.1
 # ... which is tested before, once they are so narrow, in sigma: wider ones are to find the valley
 _NARROW = 0.3
-# rounds that came to nothing are so much narrower when they are tried again
+# rounds that came to nothing are so much narrower when they are tried again; where a test of the
+# local model ended them, they are as they were
 _VAIN = 0.5
 # so much of the loss at the start is much, where a search should end
 _MUCH = 0.1
@@ -223,13 +224,13 @@ class ResidualSearch(AbstractPointSearch):
         return by_stage(self.stage, stage, branches)
 
     def _to_wide(self, scale: Array) -> "ResidualSearch":
-        center, row, fun = self.history.best(self.start)
+        center, row, _ = self.history.best(self.start)
         wide = Wide.start(center, row, scale)
         # the center is known: the samples begin at once
         wide = eqx.tree_at(
             lambda w: (w.taken, w.rounds), wide, (jnp.ones_like(wide.taken), self.wide.rounds + 1)
         )
-        stage, turn = jnp.full_like(self.stage, WIDE), Turn.start(len(center), fun)
+        stage, turn = jnp.full_like(self.stage, WIDE), Turn.start(len(center), self._level())
         return eqx.tree_at(lambda s: (s.stage, s.wide, s.turn), self, (stage, wide, turn))
 
     def _after_first(self, params: Params, funs: Float[Array, " K"]) -> "ResidualSearch":
@@ -252,8 +253,9 @@ class ResidualSearch(AbstractPointSearch):
         changed = trust, self.turn.more(sizes.step)
         local = eqx.tree_at(lambda s: (s.trust, s.turn), self, changed)
         wide, failed = self.wide, trust.failed()
-        vain = (wide.rounds > 0) & (wide.true < _TRUE)
-        scale = jnp.where(vain, _VAIN * wide.scale, jnp.maximum(wide.scale, 1))
+        vain = (wide.rounds > 0) & (wide.idle >= _IDLE * (len(self.start) + 1))
+        widest = jnp.where(wide.true < _TRUE, wide.scale, jnp.maximum(wide.scale, 1))
+        scale = jnp.where(vain, _VAIN * wide.scale, widest)
         after = where(failed, local._to_wide(scale), local)
         # where a test was lost, wide rounds go on as they were
         ended = self.turn.test & (local.turn.over() | failed)
@@ -268,7 +270,7 @@ class ResidualSearch(AbstractPointSearch):
     ) -> "ResidualSearch":
         _, lowest, fun = self.history.best(self.start)
         wanted = jnp.where(self.wide.seen, sizes.later, sizes.first)
-        wide = self.wide.sampled(params, self.history, lowest, rows, good)
+        wide = self.wide.sampled(params, self.history, rows, good, lowest, fun)
         average, full = self.average, wide.taken >= wanted
         moved = lambda: wide.stepped(self.history, params, wanted, takes_key=average is not None)
         wide = jax.lax.cond(full, moved, lambda: wide)
@@ -287,16 +289,24 @@ class ResidualSearch(AbstractPointSearch):
         anew = TrustRegion.start(jnp.asarray(radius), *self.trust.jacobian.shape)
         trust = where(came_true | wide.found, anew, self.trust.resumed())
         ended = came_true | (wide.idle >= _IDLE * (n + 1))
-        # or it shows between rounds whether it is faster
-        lower, _ = search.turn.lowered(fun)
+        # or it shows between rounds how fast it is
+        level = self._level()
+        lower, _ = search.turn.lowered(level)
         narrow = jnp.sqrt(jnp.mean(wide.scale**2)) < _NARROW
-        tests = full & search.turn.over() & lower & narrow
-        turn = where(ended, Turn.start(n, fun), search._next_turn(jnp.asarray(False))[0])
+        tests = full & search.turn.over() & lower & narrow & wide.found
+        # no round that came true is followed by a test, as the next may say so too
+        tests &= wide.true == 0
+        turn = where(ended, Turn.start(n, level), search._next_turn(jnp.asarray(False))[0])
         changed = jnp.full_like(self.stage, TRUST), trust, turn
         back = eqx.tree_at(lambda s: (s.stage, s.trust, s.turn), search, changed)
         return where(ended | tests, back, search)
 
     def _next_turn(self, failed: Bool[Array, ""]) -> tuple[Turn, Bool[Array, ""]]:
         """The turn after this one, and whether the other model has it."""
-        no, fun = jnp.asarray(False), self.history.best(self.start)[2]
-        return self.turn.next(fun, len(self.start), (failed, no), no)
+        no = jnp.asarray(False)
+        return self.turn.next(self._level(), len(self.start), (failed, no), no)
+
+    def _level(self) -> Float[Array, ""]:
+        """What turns are compared by: a loss falls by shares, and never below zero."""
+        fun = self.history.best(self.start)[2]
+        return jnp.log(jnp.maximum(fun, jnp.finfo(fun.dtype).tiny))

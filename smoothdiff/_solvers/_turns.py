@@ -12,10 +12,10 @@ _SHARE = 0.3
 
 
 class Turn(eqx.Module):
-    """Whose turn it is: `spent` evaluations of `length`, from the value `before`.
+    """Whose turn it is: `spent` evaluations, of `length` at least, from the value `before`.
 
     In a test, `rate` is by how much the other model lowered the function for each evaluation, in a
-    turn of `usual` length.
+    turn of `usual` length or more.
     """
 
     spent: Int[Array, ""]

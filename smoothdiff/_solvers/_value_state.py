@@ -190,7 +190,7 @@ class ValueState(AbstractPointSearch):
     def look_due(self, params: Params, sizes: Sizes) -> Bool[Array, ""]:
         """Also between rounds, once the local model has failed: wide samples alone take long.
 
-        Where the function has noise they go on, as before the first round nobody knows.
+        Where the function has noise they go on. Before the first round nobody knows if it has.
         """
         between = (self.stage == WIDE) & (self.rounds > 0) & (self.taken == 0)
         alone = has_box(params) & between & self.trust.failed() & ~self.noisy

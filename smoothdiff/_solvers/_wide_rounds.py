@@ -55,12 +55,21 @@ class Wide(eqx.Module):
         return Wide(center, row, still, scale, before, none, none, none, none, no, no)
 
     def sampled(
-        self, params: Params, history: History, lowest: Array, rows: Array, good: Array
+        self,
+        params: Params,
+        history: History,
+        rows: Array,
+        good: Array,
+        lowest: Float[Array, " P"],
+        least: Float[Array, ""],
     ) -> "Wide":
-        """With these residuals, the newest of the history, in which the `lowest` ones are."""
+        """With these residuals, the newest of the history.
+
+        The `lowest` ones are those of its best point, the loss there is the `least`.
+        """
         first, fun = self.taken == 0, jnp.where(good[0], jnp.sum(rows[0] ** 2) / 2, jnp.inf)
         near = jnp.max(jnp.abs(self.move / (params.sigma * self.scale))) < 1
-        held = (fun < self.before / 2) & (fun <= jnp.sum(lowest**2) / 2) & near
+        held = (fun < self.before / 2) & (fun <= least) & near
         newest = history.rows[-len(rows) :]
         lower = jnp.any(jnp.all(newest == lowest[None], axis=1) & good)
         return Wide(

@@ -67,12 +67,11 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     the wide model alone.
 
     Within finite bounds a search looks once at 2n + 1 points spread over all of the box: before it
-    ends, or as soon as its local model has failed, if the function has no noise. Where one is
-    lower, it begins anew, and may look again. Else it goes on. A value that is not finite ends
-    nothing there. Searches that `restarts` add do not look. Where there is no box and it has
-    converged more than 1e5 sigma from the start, it begins anew there once, half as wide as it came
-    far, and looks at one point twice as far away each time: a function that falls for ever has no
-    minimum.
+    ends, or once its local model has failed and a round has shown no noise. Where one is lower, it
+    begins anew, and may look again. Else it goes on. A value that is not finite ends nothing there.
+    Searches that `restarts` add do not look. Where there is no box and it has converged more than
+    1e5 sigma from the start, it begins anew there once, half as wide as it came far, and looks at
+    one point twice as far away each time: a function that falls for ever has no minimum.
 
     Bounds are never left. A sample beyond them is clamped or, where that would throw it out of a
     narrow valley, pulled back along its ray, and the models take it where it was evaluated.
