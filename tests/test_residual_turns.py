@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import smoothdiff as sd
+from smoothdiff._solvers._residual_search import ResidualSearch
 from smoothdiff._solvers._stages import TRUST, WIDE
 from tests.parts import quick_of
 
@@ -51,20 +52,24 @@ def test_where_a_function_jumps_wide_rounds_go_on_where_they_were():
 
     def image(y):
         discs = np.reshape(y, (3, 3))
-        return sum((across - a) ** 2 + (down - b) ** 2 < (0.1 + r / 5) ** 2 for a, b, r in discs)
+        each = [(across - a) ** 2 + (down - b) ** 2 < (0.1 + r / 5) ** 2 for a, b, r in discs]
+        return np.sum(each, axis=0, dtype=np.float32)
 
     true = np.array([0.3, 0.3, 0.3, 0.7, 0.6, 0.6, 0.25, 0.75, 0.1])
     start = jnp.asarray(np.random.default_rng(0).random(9), jnp.float32)
     settings = {"key": jax.random.key(0), "bounds": (jnp.zeros(9), jnp.ones(9))}
-    search, lost = sd.Search(start, residuals=True, **settings), 0
+    search, left, lost = sd.Search(start, residuals=True, **settings), None, 0
     for _ in range(300):
         before = search._state.search
         points = search.ask(1)
-        search.tell(points, [(image(p) - image(true)).astype(np.float32) for p in points])
+        search.tell(points, [image(p) - image(true) for p in points])
         after = search._state.search
+        assert isinstance(before, ResidualSearch)
+        assert isinstance(after, ResidualSearch)
         if before.stage == WIDE and after.stage == TRUST:
             left = after
         if before.turn.test and after.stage == WIDE:
+            assert left is not None
             lost += 1
             np.testing.assert_array_equal(after.wide.center, left.wide.center)
             np.testing.assert_array_equal(after.wide.scale, left.wide.scale)
