@@ -27,18 +27,10 @@ from smoothdiff._solvers._turns import Turn
 from smoothdiff._solvers._where import where
 from smoothdiff._solvers._wide_rounds import Wide, further, sides_of
 
-# evaluations of wide rounds since the last lower point, for each parameter, until the local model
-# goes on: around a lower point that they found with a radius of so many widths, else as it was
-_IDLE, _NARROWER = 6, 0.1
-# ... which is tested before, once they are so narrow, in sigma: wider ones are to find the valley
-_NARROW = 0.3
-# rounds that came to nothing are so much narrower when they are tried again; where a test of the
-# local model ended them, they are as they were
-_VAIN = 0.5
+# around a lower point that wide rounds found the local model has a radius of so many widths
+_NARROWER = 0.1
 # so much of the loss at the start is much, where a search should end
 _MUCH = 0.1
-# so many steps in a row that halve the loss, within the width, are trusted again
-_TRUE = 2
 
 
 class ResidualSearch(AbstractPointSearch):
@@ -252,16 +244,13 @@ class ResidualSearch(AbstractPointSearch):
         trust = self.trust.revise(proposal, row, rows, good, compared=self.average is None)
         changed = trust, self.turn.more(sizes.step)
         local = eqx.tree_at(lambda s: (s.trust, s.turn), self, changed)
-        wide, failed = self.wide, trust.failed()
-        vain = (wide.rounds > 0) & (wide.idle >= _IDLE * (len(self.start) + 1))
-        widest = jnp.where(wide.true < _TRUE, wide.scale, jnp.maximum(wide.scale, 1))
-        scale = jnp.where(vain, _VAIN * wide.scale, widest)
-        after = where(failed, local._to_wide(scale), local)
+        failed = trust.failed()
+        after = where(failed, local._to_wide(self.wide.later_scale()), local)
         # where a test was lost, wide rounds go on as they were
         ended = self.turn.test & (local.turn.over() | failed)
         turn, lost = local._next_turn(failed)
         tested = dataclasses.replace(local, turn=turn)
-        changed = jnp.full_like(self.stage, WIDE), jnp.zeros_like(wide.idle)
+        changed = jnp.full_like(self.stage, WIDE), jnp.zeros_like(self.wide.idle)
         resumed = eqx.tree_at(lambda s: (s.stage, s.wide.idle), tested, changed)
         return where(ended, where(lost, resumed, tested), after)
 
@@ -278,7 +267,7 @@ class ResidualSearch(AbstractPointSearch):
         search = eqx.tree_at(lambda s: (s.wide, s.turn), self, changed)
         if average is not None:
             return search.with_mean(where(full, average.after(wide.center), average))
-        came_true, n = wide.true >= _TRUE, len(self.start)
+        came_true, n = wide.came_true(), len(self.start)
         # the local model begins anew around what was found, or goes on
         radius = jnp.where(
             came_true,
@@ -288,14 +277,11 @@ class ResidualSearch(AbstractPointSearch):
         radius = jnp.maximum(jnp.asarray(radius), jnp.finfo(fun.dtype).eps)
         anew = TrustRegion.start(jnp.asarray(radius), *self.trust.jacobian.shape)
         trust = where(came_true | wide.found, anew, self.trust.resumed())
-        ended = came_true | (wide.idle >= _IDLE * (n + 1))
+        ended = came_true | wide.came_to_nothing()
         # or it shows between rounds how fast it is
         level = self._level()
         lower, _ = search.turn.lowered(level)
-        narrow = jnp.sqrt(jnp.mean(wide.scale**2)) < _NARROW
-        tests = full & search.turn.over() & lower & narrow & wide.found
-        # no round that came true is followed by a test, as the next may say so too
-        tests &= wide.true == 0
+        tests = full & search.turn.over() & lower & wide.may_wait()
         turn = where(ended, Turn.start(n, level), search._next_turn(jnp.asarray(False))[0])
         changed = jnp.full_like(self.stage, TRUST), trust, turn
         back = eqx.tree_at(lambda s: (s.stage, s.trust, s.turn), search, changed)

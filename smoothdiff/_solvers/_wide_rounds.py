@@ -22,6 +22,14 @@ _NARROWEST = 0.1
 LONGEST = 2.0
 # a step is tried so many times as far, where that is at least sigma
 _FURTHER = 5.0
+# so many steps in a row that halve the loss, within the width, came true
+_TRUE = 2
+# rounds come to nothing after so many evaluations, for each parameter and one, that found no lower
+# point; they are so much narrower when they are tried again
+_IDLE, _VAIN = 6, 0.5
+# the local model is tested only once samples are so narrow, in sigma: wider ones are to find the
+# valley
+_NARROW = 0.3
 
 
 class Wide(eqx.Module):
@@ -53,6 +61,28 @@ class Wide(eqx.Module):
         still = jnp.zeros_like(center)
         no = jnp.asarray(False)
         return Wide(center, row, still, scale, before, none, none, none, none, no, no)
+
+    def came_true(self) -> Bool[Array, ""]:
+        """Whether the steps are what they promise, so that the local model may go on."""
+        return self.true >= _TRUE
+
+    def came_to_nothing(self) -> Bool[Array, ""]:
+        """Whether no lower point was found for long."""
+        return self.idle >= _IDLE * (len(self.center) + 1)
+
+    def may_wait(self) -> Bool[Array, ""]:
+        """Whether the local model may be tested before the next round.
+
+        No round that came true is followed by a test, as the next one may say so too.
+        """
+        narrow = jnp.sqrt(jnp.mean(self.scale**2)) < _NARROW
+        return narrow & self.found & (self.true == 0)
+
+    def later_scale(self) -> Float[Array, " n"]:
+        """How wide the samples are where the local model has failed since."""
+        vain = (self.rounds > 0) & self.came_to_nothing()
+        widest = jnp.where(self.came_true(), jnp.maximum(self.scale, 1), self.scale)
+        return jnp.where(vain, _VAIN * self.scale, widest)
 
     def sampled(
         self,

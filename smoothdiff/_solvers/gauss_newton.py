@@ -63,11 +63,11 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     damped as by Levenberg and Marquardt. The width of each parameter follows its standard error:
     one that tells little so far stays wide while others are narrow. The local model takes over
     again once two steps of the regression in a row are as predicted, or once 6 (n + 1) evaluations
-    have found nothing lower. It is tested after 6 (n + 1) evaluations of them that lowered the
-    loss, once samples are below 0.3 sigma wide: wider ones are to find the valley. A test has
-    4 (n + 1) steps at most. The model stays if it lowers the logarithm of the loss at 0.3 times the
-    rate. Else the rounds go on where they were, and the next test is after twice as many. Where the
-    function takes a key, there are no tests.
+    have found nothing lower. Before that it is tested: after 6 (n + 1) evaluations that lowered the
+    loss, if the samples are then below 0.3 sigma wide. Wider ones are to find the valley. A test
+    has 4 (n + 1) steps at most. The local model stays if it lowers the logarithm of the loss at 0.3
+    times the rate of the rounds before. Else the rounds go on where they were, and the next test
+    comes after twice as many evaluations. Where the function takes a key, there are no tests.
 
     Within finite bounds a search that would end with more than a tenth of the loss of its start
     looks at 2n + 1 points spread over all of the box. Where one is lower, it begins anew. A value
