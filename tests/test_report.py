@@ -15,7 +15,7 @@ from benchmarks._names import NAMES, OURS
 from benchmarks._reached import Took, alike, machines, reached, took
 from benchmarks._summary import without_one
 from benchmarks._task import Method
-from benchmarks.studies.report import _chart, _compare, _finder, _overall, _scene
+from benchmarks.studies.report import _chart, _compare, _finder, _overall, _page, _scene
 from benchmarks.studies.report._scene import MANY
 from benchmarks.studies.report._standing import first, loses
 
@@ -85,6 +85,12 @@ def test_who_is_faster_beyond_the_quartiles():
     assert _compare.ratio(at(1, 2, 3), at(4, 8, 9)) == 4
     assert _compare.ratio(at(1, 2, 3), never) is None
     assert _compare.ratio(at(0, 0, 0), at(1, 1, 1)) is None  # solved at the start
+
+
+def test_what_rounds_to_once_as_fast_is_level():
+    assert _page.in_words(1.04, "seconds") == _page.in_words(0.96, "evaluations") == "level"
+    assert _page.in_words(2.0, "evaluations") == "2× fewer"
+    assert _page.in_words(0.25, "seconds") == "4× slower"
 
 
 def test_means_are_geometric_with_an_interval_over_scenes():

@@ -117,8 +117,6 @@ def _bar(answer: _finder.Answer, cost: str) -> dict[str, Any]:
         ours, theirs = answer.solved
         only = answer.ours if ours else answer.peer.name
         return bar | {"told": f"only {only} gets there" if ours or theirs else "neither gets there"}
-    better, worse = WORDS[cost]
-    times, word = (of.value, better) if of.value >= 1 else (1 / of.value, worse)
     one, at = _place(1), _place(of.value)
     kind = "win" if of.value >= 1 else "lose"
     on = f"{of.scenes} scene{'s' * (of.scenes > 1)}"
@@ -130,7 +128,14 @@ def _bar(answer: _finder.Answer, cost: str) -> dict[str, Any]:
     elif answer.close(cost):
         kind, on = "even", f"{on}, quartiles overlap"
     bar |= {"left": min(one, at), "width": round(abs(at - one), 1), "kind": kind, "interval": on}
-    return bar | {"told": f"{times:.2g}× {word}"}
+    return bar | {"told": in_words(of.value, cost)}
+
+
+def in_words(value: float, cost: str) -> str:
+    """How many times as fast, in two digits; what rounds to once as fast is level."""
+    better, worse = WORDS[cost]
+    times, word = (value, better) if value >= 1 else (1 / value, worse)
+    return "level" if f"{times:.2g}" == "1" else f"{times:.2g}× {word}"
 
 
 def _place(times: float) -> float:
