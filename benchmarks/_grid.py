@@ -50,7 +50,8 @@ def to_rich(grid: Grid) -> Table:
     )
     shown.add_column(grid.columns[0], no_wrap=True)
     for column in grid.columns[1:]:
-        shown.add_column(column, justify="right" if grid.numbers else "left")
+        # no number loses its end where the terminal is narrow
+        shown.add_column(column, justify="right" if grid.numbers else "left", overflow="fold")
     for row in grid.rows:
         cells = [escape_markup(cell) for cell in (row.name, *row.cells)]
         shown.add_row(*cells, style="bold" if row.strong else None, end_section=row.end)

@@ -23,6 +23,7 @@ from benchmarks._machine import machine
 HERE = Path(__file__).parent
 COMMITTED = HERE / "results"  # what the tables of the README were made from
 RUNS = HERE / "runs"  # what a user runs; git ignores it
+WIDEST = 1000  # letters that a line of a table may have
 
 
 def about(options: Namespace) -> dict[str, Any]:
@@ -63,9 +64,12 @@ def committed(name: str, results: Path | None = None) -> dict[str, Any] | None:
 
 
 def show(grids: Iterable[Grid]) -> None:
-    """Prints tables."""
+    """Prints tables; where nobody sees the end of a line, as in a file, as wide as they are."""
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=WIDEST)
     for grid in grids:
-        Console().print(to_rich(grid))
+        console.print(to_rich(grid))
 
 
 def write(results: dict[str, Any], folder: Path) -> dict[str, Any]:

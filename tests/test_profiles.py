@@ -9,6 +9,7 @@ import pytest
 from jax.core import Tracer
 
 from benchmarks import _study
+from benchmarks._grid import Grid, Row
 from benchmarks._task import NotAble, precision
 from benchmarks.studies import profiles
 from benchmarks.studies.profiles import kept, kinds, ours, peers
@@ -151,7 +152,7 @@ def test_a_run_is_written_shown_and_taken_up_again(tmp_path, monkeypatch, capsys
     assert results["missing"] == {"Absent": "needs a package: pip install absent"}
     shown = capsys.readouterr().out
     assert "not able: needs a package" in shown
-    assert "Bowls (2)" in shown
+    assert "Bowls: 2 problems" in shown
     assert (tmp_path / "profiles.png").exists()
 
     _study.run(profiles, options, tmp_path)
@@ -217,3 +218,10 @@ def test_ours_is_compiled_once_for_functions_of_a_shape(name):
             counts.append(sum(traced))
         # once more for the shape of what it returns
         assert 0 < counts[0] <= counts[1] <= counts[0] + 1
+
+
+def test_no_number_of_a_wide_table_is_cut_in_a_file(capsys):
+    cells = tuple(f"{each}{'/100' * 3}" for each in range(20))
+    _study.show([Grid("Wide", "", ("", *"abcdefghijklmnopqrst"), (Row("a row", cells),))])
+    printed = capsys.readouterr().out
+    assert all(cell in printed for cell in cells)

@@ -1,7 +1,6 @@
 """The results as tables and as a picture."""
 
 from collections.abc import Iterator
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -17,34 +16,30 @@ ABREAST = 4
 
 
 def tables(results: dict[str, Any]) -> Iterator[Grid]:
-    """Shares at some budgets, a table for each set; and what did not run."""
-    for _, panels in groupby(results["panels"], key=lambda panel: panel["set"]):
-        yield _set(list(panels), list(results["methods"]))
+    """Shares at some budgets, a table for each panel; and what did not run."""
+    for panel in results["panels"]:
+        yield _panel(panel, list(results["methods"]))
     if results["missing"]:
         rows = tuple(Row(who, (f"not able: {why}",)) for who, why in results["missing"].items())
         yield Grid("Did not run", "", ("", ""), rows, numbers=False)
 
 
-def _set(panels: list[dict[str, Any]], methods: list[str]) -> Grid:
+def _panel(panel: dict[str, Any], methods: list[str]) -> Grid:
     rows = []
-    for panel in panels:
-        name = f"{panel['title']} ({panel['problems']})"
-        for method in methods:
-            of = [found[method]["at"] for found in panel["levels"].values() if method in found]
-            shares = ("/".join(f"{100 * each:.0f}" for each in at) for at in zip(*of, strict=True))
-            if of:
-                failed = str(panel["failed"].get(method, ""))
-                rows.append(Row(name, (name_of(method), *shares, failed), strong=is_ours(method)))
-                name = ""
-        rows[-1:] = [row._replace(end=True) for row in rows[-1:]]
+    for method in methods:
+        of = [found[method]["at"] for found in panel["levels"].values() if method in found]
+        shares = ("/".join(f"{100 * each:.0f}" for each in at) for at in zip(*of, strict=True))
+        if of:
+            failed = str(panel["failed"].get(method, ""))
+            rows.append(Row(name_of(method), (*shares, failed), strong=is_ours(method)))
     what = f"problems solved to {'/'.join(map('{:g}'.format, TAUS))}, by exact values"
-    if PAIRS in panels[0]["levels"]:
+    if PAIRS in panel["levels"]:
         what = "pairs of a function and one of 51 targets from 100 to 1e-8 above the lowest value"
-    budgets = (f"{budget} {_unit(panels[0])}" for budget in panels[0]["budgets"])
+    budgets = (f"{budget} {_unit(panel)}" for budget in panel["budgets"])
     return Grid(
-        title=f"Shares within budgets: {panels[0]['set']}",
+        title=f"{panel['title']}: {panel['problems']} problems, shares within budgets",
         caption=f"Percent of the {what}; and how many runs ended by an error.",
-        columns=("problems", "method", *budgets, "failed"),
+        columns=("method", *budgets, "failed"),
         rows=tuple(rows),
     )
 
