@@ -1,11 +1,9 @@
 r"""The Jacobian of the nearest evaluations: the fit that changes the last Jacobian least.
 
-$$ \min_J \; \sum_i w_i \, |r_i - r - J (x_i - x)|^2 + \epsilon \, |J - J_{last}|^2, \qquad
-   w_i = \frac{1}{1 + (|x_i - x| / l)^4} $$
+$$ \min_J \; \sum_i w_i \, |r_i - r - J (x_i - x)|^2 + \epsilon \, |J - J_{last}|^2 $$
 
-x is the best point and r its residuals. Each evaluation makes J better where a search goes. What a
-linear model leaves out grows with the square of the distance, so far ones hardly count beside near
-ones. Within the length l, about the radius, all count: there noise and jumps are what is left out.
+x is the best point and r its residuals; the weights fall with the distance from it. Each
+evaluation makes J better where a search goes.
 
 Source: own; the least change is Broyden's.
 """
@@ -17,11 +15,8 @@ from jaxtyping import Array, Bool, Float
 from smoothdiff._products import dot
 from smoothdiff._solvers._history import History
 
-# evaluations that a fit may use for each parameter, and how far away, in widths
-_USED, _FARTHEST = 3, 2.0
-# within this share of the radius evaluations count alike; and within this one of the width, as a
-# radius that failures made small says less of the function than of its jumps
-_ALIKE, _NEAR = 0.75, 0.075
+# evaluations that a fit may use for each parameter, and how far they count, in radii
+_USED, _REACH, _FARTHEST = 3, 1.5, 2.0
 # what is not known of a direction that hardly any evaluation has, against the others, squared
 _RIDGE = 1e-8
 # a direction with less than this share of the radius is not covered by evaluations
@@ -64,8 +59,7 @@ def nearest_fit(
     width = jnp.maximum(jnp.maximum(radius, farthest), tiny)
     used = distance <= _FARTHEST * width
     far = jnp.asarray(jnp.where(used, distance, 0)) / width
-    length = jnp.maximum(_ALIKE * radius / width, _NEAR)
-    weight = jnp.where(used, 1 / (1 + (far / length) ** 4), 0)
+    weight = jnp.where(used, 1 / (1 + (far / _REACH) ** 4), 0)
     a = jnp.where(used[:, None], away[near], 0) / width
     change = jnp.where(used[:, None], history.rows[near] - row[None], 0)
     # by singular values, since squares of them would take half of the digits
