@@ -57,8 +57,8 @@ def executor_of(way):
             distributed.Client(cluster) as client,
         ):
             yield client
-            # a worker that is just being replaced cannot be closed; all runs have ended, so one that
-            # Dask does not replace is none of ours
+            # a worker that is just being replaced cannot be closed; all runs have ended, so that
+            # it is no fault of ours if Dask takes longer
             with contextlib.suppress(distributed.TimeoutError):
                 client.wait_for_workers(2, timeout=60)
     else:
