@@ -145,7 +145,7 @@ def line(name: str, title: str, solver: str, took: dict[Any, list[float]]) -> di
     """Medians of the shortest call and of the best setting, and their ratio from each start."""
     best = min(FACTORS, key=lambda factor: (np.median(took[factor]), float(np.mean(took[factor]))))
     found = {"shortest": quartiles(took[None]), "best": quartiles(took[best]), "factor": best}
-    ratio = float(np.median(took[None]) / np.median(took[best]))
+    ours, least = float(np.median(took[None])), float(np.median(took[best]))
     solved = {
         "shortest": sum(map(np.isfinite, took[None])),
         "best": sum(map(np.isfinite, took[best])),
@@ -154,7 +154,7 @@ def line(name: str, title: str, solver: str, took: dict[Any, list[float]]) -> di
         "name": name,
         "title": title,
         "solver": solver,
-        "ratio": ratio if np.isfinite(ratio) else None,
+        "ratio": ours / least if np.isfinite(ours) else None,
         "solved": {key: int(number) for key, number in solved.items()},
         "took": {str(factor): values for factor, values in took.items()},
     } | found
