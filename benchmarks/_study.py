@@ -64,7 +64,7 @@ def committed(name: str, results: Path | None = None) -> dict[str, Any] | None:
 
 
 def show(grids: Iterable[Grid]) -> None:
-    """Prints tables; where nobody sees the end of a line, as in a file, as wide as they are."""
+    """Prints tables. A file gets all of their width; a terminal folds what it has no room for."""
     console = Console()
     if not console.is_terminal:
         console = Console(width=WIDEST)

@@ -3,13 +3,15 @@
 import json
 from argparse import Namespace
 from concurrent.futures import ThreadPoolExecutor
+from io import StringIO
 
 import numpy as np
 import pytest
 from jax.core import Tracer
+from rich.console import Console
 
 from benchmarks import _study
-from benchmarks._grid import Grid, Row
+from benchmarks._grid import Grid, Row, to_rich
 from benchmarks._task import NotAble, precision
 from benchmarks.studies import profiles
 from benchmarks.studies.profiles import kept, kinds, ours, peers
@@ -225,3 +227,12 @@ def test_no_number_of_a_wide_table_is_cut_in_a_file(capsys):
     _study.show([Grid("Wide", "", ("", *"abcdefghijklmnopqrst"), (Row("a row", cells),))])
     printed = capsys.readouterr().out
     assert all(cell in printed for cell in cells)
+
+
+def test_no_number_of_a_table_is_cut_in_a_narrow_terminal():
+    grid = Grid("Narrow", "", ("", *"abc"), (Row("row", ("84/66/54", "97/88/69", "99/93/88")),))
+    printed = StringIO()
+    Console(file=printed, width=24).print(to_rich(grid))
+    # what is folded goes on in the next line
+    digits = [c for c in printed.getvalue() if c.isdigit()]
+    assert sorted(digits) == sorted("846654978869999388")

@@ -142,10 +142,10 @@ def there(run: dict[str, Any], lowest: float) -> float:
 
 
 def line(name: str, title: str, solver: str, took: dict[Any, list[float]]) -> dict[str, Any]:
-    """Medians of the shortest call and of the best setting, and their ratio from each start."""
+    """Medians of the shortest call and of the best setting, and their ratio."""
     best = min(FACTORS, key=lambda factor: (np.median(took[factor]), float(np.mean(took[factor]))))
     found = {"shortest": quartiles(took[None]), "best": quartiles(took[best]), "factor": best}
-    ours, least = float(np.median(took[None])), float(np.median(took[best]))
+    ours, theirs = (float(np.median(took[each])) for each in (None, best))
     solved = {
         "shortest": sum(map(np.isfinite, took[None])),
         "best": sum(map(np.isfinite, took[best])),
@@ -154,7 +154,7 @@ def line(name: str, title: str, solver: str, took: dict[Any, list[float]]) -> di
         "name": name,
         "title": title,
         "solver": solver,
-        "ratio": ours / least if np.isfinite(ours) else None,
+        "ratio": ours / theirs if np.isfinite(ours) else None,
         "solved": {key: int(number) for key, number in solved.items()},
         "took": {str(factor): values for factor, values in took.items()},
     } | found
@@ -185,6 +185,7 @@ def tables(results: dict[str, Any]) -> list[Grid]:
 
 def draw(results: dict[str, Any], folder: Path) -> None:
     """The ratio of the medians of each case."""
-    rows = {case["title"]: [case["ratio"] or np.inf] for case in results["cases"]}
+    ratios = {case["title"]: case["ratio"] for case in results["cases"]}
+    rows = {name: [np.inf if ratio is None else ratio] for name, ratio in ratios.items()}
     label = "evaluations of the shortest call over those of the best hand-chosen sigma"
     dots(folder / "defaults.png", rows, TARGET, label, (0.5, 3.0))
