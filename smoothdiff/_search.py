@@ -25,8 +25,6 @@ from smoothdiff._unit_space import UnitSpace
 _LOST, _SOME = 2, 4
 # two programs may give the same point with so many roundings between
 _ROUNDINGS = 8
-# what is asked for beyond the step of the local model: its end nearer or further, as shares
-_SHARES = (2.0, 0.5, 4.0, 0.25)
 
 
 class Search:
@@ -41,9 +39,9 @@ class Search:
     values in the same calls, with none still out, goes on where the old one was.
 
     `ask` gives what the model wants next. If that is still out, further points follow: in the local
-    model shorter and longer steps, in a round of samples its next ones. A point that nobody tells
-    is given out again, after twice as many others as are out. One point at a time, these are the
-    steps of `minimise` and `least_squares`.
+    model shorter and longer steps and points beside them, in a round of samples its next ones. A
+    point that nobody tells is given out again, after twice as many others as are out. One point at
+    a time, these are the steps of `minimise` and `least_squares`.
 
     Args:
         y0: where to start, a pytree of numbers and arrays.
@@ -224,10 +222,10 @@ class Search:
         if search.stage != TRUST:
             yield from self._round(count)
         else:
-            points, _ = self._steps.propose(self._y, self._state, 1)
-            end, here = np.asarray(points[0]), np.asarray(search.iterate())
-            yield end
-            yield from (self._clipped(here + share * (end - here)) for share in _SHARES)
+            # what comes of it is taken in as a step, so it must be the same to the last bit
+            yield np.asarray(self._steps.propose(self._y, self._state, 1)[0][0])
+            if count > 1:
+                yield from self._round(count)[1:]
         params = self._steps.parts(self._y, self._state).params()
         sigma, here = np.asarray(params.sigma), np.asarray(search.iterate())
         # so wide that there are other points, where a radius has come to nothing
@@ -237,7 +235,7 @@ class Search:
             yield self._clipped(here + width * self._random.standard_normal(width.shape))
 
     def _round(self, count: int) -> list[np.ndarray]:
-        """The next points of this round, and of no later one."""
+        """The next points of this round, and of no later one; or a step and points beside it."""
         # a power of two, since it is compiled for each
         count = 1 << (count - 1).bit_length()
         return list(np.asarray(self._steps.propose(self._y, self._state, count)[0]))

@@ -199,3 +199,19 @@ def test_bounds_far_away_change_nothing():
             search.tell(points, [valley(point) for point in points])
         took.append(search.evaluations)
     assert took[0] == took[1] < 100
+
+
+@pytest.mark.slow
+def test_eight_points_of_each_round_are_as_good_as_num_samples(x64):
+    """Ten evaluations determine a quadratic of three parameters."""
+    bend = np.array([[1.0, 0.3, 0.0], [0.0, 2.0, 0.5], [0.0, 0.0, 0.7]])
+    fun = lambda y: float(np.sum((bend @ (np.asarray(y) - [1.0, -0.5, 2.0])) ** 2))
+    rounds = []
+    for seed in range(5):
+        search = sd.Search(np.random.default_rng(seed).random(3), key=jax.random.key(seed))
+        rounds.append(0)
+        while rounds[-1] < 30 and not search.fun < 1e-10:
+            points = search.ask(8)
+            search.tell(points, [fun(y) for y in points])
+            rounds[-1] += 1
+    assert np.median(rounds) <= 6
