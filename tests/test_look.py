@@ -7,6 +7,8 @@ import optimistix as optx
 import pytest
 
 import smoothdiff as sd
+from smoothdiff._params import take_apart
+from smoothdiff._solvers._look import Look
 from smoothdiff._solvers._stages import LOOK
 from tests.parts import quick_of
 
@@ -242,3 +244,15 @@ def test_a_minimum_far_away_is_found_and_looked_beyond():
         np.testing.assert_allclose(found.y, place, rtol=1e-3)
     beyond = np.all(np.abs(np.array(points) - 2e6) < 1e4, axis=1)
     assert 1 <= np.sum(beyond) <= 2
+
+
+def test_the_last_points_change_one_parameter_each():
+    params = take_apart(jnp.zeros(3), 1.0, (-1.0, 1.0))
+    best, samples = jnp.array([0.5, -0.25, 0.125]), jax.random.normal(jax.random.key(0), (7, 3))
+    look = Look.start(best)
+    # more are asked for than there are
+    points = np.asarray(jax.jit(lambda: look.points(params, best, lambda count: samples, 8))())
+    changed = points != np.asarray(best)
+    assert np.all(np.sum(changed[:4], axis=1) == 3)
+    np.testing.assert_array_equal(changed[4:7], np.eye(3, dtype=bool))
+    np.testing.assert_array_equal(points[7], points[6])

@@ -339,9 +339,9 @@ def test_restarts_begin_anywhere_within_the_bounds():
     points = np.array(EVALUATED)
     assert one.reason in ("converged", "noise")
     assert run.reason in ("converged", "noise")
-    # the first search is the same
+    # the first search is the same, but for the last points of its look, which are anywhere, too
     same = len(one.history)
-    np.testing.assert_array_equal(points[:same], alone[:same])
+    np.testing.assert_array_equal(points[: same - 2], alone[: same - 2])
     assert np.all(np.abs(points) <= 50)
     # at its end it looks anywhere; of the others some begin far from there
     far, look = np.max(np.abs(points), axis=1) > 10, 2 * 2 + 1

@@ -330,17 +330,21 @@ def test_solvers_can_search_in_unit_coordinates():
         return (y["n"].astype(float) - 7) ** 2 / 20 + jnp.abs(jnp.log(y["gain"]) - 5)
 
     solver = sd.NewtonCG(space.sigma())
-    result = sd.minimise(
-        space.wrap(fun),
-        space.unit(y0),
-        key=jax.random.key(0),
-        solver=solver,
-        bounds=space.bounds(),
-        max_evaluations=300,
-    )
-    y = space.natural(result.y)
-    assert int(y["n"]) == 7
-    np.testing.assert_allclose(np.log(y["gain"]), 5, atol=0.1)
+    found = []
+    for seed in range(5):
+        result = sd.minimise(
+            space.wrap(fun),
+            space.unit(y0),
+            key=jax.random.key(seed),
+            solver=solver,
+            bounds=space.bounds(),
+            max_evaluations=300,
+        )
+        y = space.natural(result.y)
+        np.testing.assert_allclose(np.log(y["gain"]), 5, atol=0.1)
+        found.append(int(y["n"]))
+    # where it looks is by chance
+    assert found.count(7) >= 4
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,9 @@
 """A look over the whole box of the bounds, or further on, where a search has little left to do.
 
 A search knows a neighbourhood. Where it is in a minimum of little depth, a few points anywhere
-are mostly lower; where it found a good one, they cost no more than a first quadratic model.
+are mostly lower; where it found a good one, they cost no more than a first quadratic model. The
+last of them differ from the best point in one parameter each: one that jumps may be wrong where
+the others are so right that no point anywhere is lower.
 
 Where there is no box a search may run off. So far from the start that steps beside the distance are
 small, and differences of values are rounding, it seems to have converged. A point twice as far away
@@ -11,6 +13,7 @@ tells.
 from collections.abc import Callable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -84,15 +87,21 @@ class Look(eqx.Module):
         best: Float[Array, " n"],
         draw: Callable[[int], Float[Array, "k n"]],
         count: int,
+        axes: bool = True,
     ) -> Float[Array, "K n"]:
         """The next points: as evenly spread over the box as normal ones over space.
 
-        Without a box they are beyond the best one, as seen from the start.
+        The last n change one parameter of the best point each if `axes`. Without a box all are
+        beyond the best one, as seen from the start.
         """
+        n = len(best)
         at = self.taken + jnp.arange(count, dtype=jnp.int32)
         times = (1 + at).astype(best.dtype)[:, None]
         further = best[None] + times * (best - self.origin)[None]
-        return over_box(params, lambda: draw(self.length(len(best))), at, further)
+        points = over_box(params, lambda: draw(self.length(n)), at, further)
+        along = jax.nn.one_hot(jnp.minimum(at, 2 * n) - n - 1, n, dtype=bool)
+        others = has_box(params) & axes & (at > n)[:, None] & ~along
+        return jnp.where(others, best[None], points)
 
     def seed(self, looking: Bool[Array, ""]) -> Int[Array, ""]:
         """What is added to those of a search's samples."""

@@ -70,7 +70,9 @@ class ValueSearch(ValueState):
         branches = [first, local, wide, further]
         if (look := self.look) is not None:
             best = self.history.best(self.start)[0]
-            branches.append(lambda: (look.points(params, best, draw, count), nothing))
+            # a scan that is to come goes along all axes
+            axes = self.scan is None
+            branches.append(lambda: (look.points(params, best, draw, count, axes), nothing))
         if (scan := self.scan) is not None:
             branches.append(lambda: (scan.propose(*bounds_of(params), count), nothing))
         return by_stage(self.stage, stage, branches)

@@ -66,7 +66,8 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     With 100 parameters and more, or with an optax schedule of sigma, each step takes a batch, and
     the wide model alone.
 
-    Within finite bounds a search looks once at 2n + 1 points spread over all of the box: before it
+    Within finite bounds a search looks once at n + 1 points spread over all of the box, and at n
+    that differ from the best one in one parameter each, or with `restarts` anywhere, too: before it
     ends, or once its local model has failed and a round has shown no noise. Where one is lower, it
     begins anew, and may look again. Else it goes on. A value that is not finite ends nothing there.
     Searches that `restarts` add do not look. Where there is no box and it has converged more than
