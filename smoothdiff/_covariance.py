@@ -27,6 +27,8 @@ _CURVED, _NOISY = 0.01, 0.5
 # a parameter that takes less than this share in directions that are not known is known, and so is a
 # variance of which they have less
 _SHARE = 0.01
+# sums with a parameter may be off by so many of its roundings
+_DIGITS = 8
 # residuals at a time, in float64
 _CHUNK = 65536
 
@@ -94,6 +96,9 @@ def slopes(
     squares, noise, curved = (np.zeros((len(scale), len(scale))) for _ in found)
     inside = np.ix_(moved, moved)
     squares[inside], noise[inside], curved[inside] = found
+    # a parameter is no better than its last digits, and so is what it changes along with others
+    digits = _DIGITS * np.finfo(rows.dtype).eps * np.max(np.abs(points), axis=0) / scale
+    noise += np.sum(np.diag(squares) * digits**2) * np.eye(len(scale))
     noise[~moved, ~moved] = 1
     return Slopes(squares, noise, curved, scale, *even)
 
