@@ -251,7 +251,7 @@ def test_evaluations_that_all_came_back_to_the_center_leave_the_others_in_the_mo
 def test_a_step_within_rounding_says_nothing_against_the_model(x64):
     trust, proposal, _, fun = proposal_of(known(around(10)))
     higher = jnp.asarray([fun + 1]), jnp.ones(1, bool)
-    lost = proposal._replace(lost=jnp.asarray(True))
+    lost = proposal._replace(lost=jnp.ones_like(proposal.lost))
     after = REVISE(trust, lost, jnp.asarray(fun), *higher)
     assert (after.radius, after.fails) == (trust.radius, 0)
 

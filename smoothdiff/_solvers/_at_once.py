@@ -23,10 +23,16 @@ def radii(radius: Float[Array, ""], count: int) -> Float[Array, " M"]:
     return radius * jnp.asarray(factors, radius.dtype)
 
 
+def least_length(place: Float[Array, " n"]) -> Float[Array, ""]:
+    """How far from there a function can be told apart: the root of the rounding."""
+    return jnp.sqrt(jnp.finfo(place.dtype).eps) * jnp.max(jnp.abs(place))
+
+
 def beside(
     steps: Float[Array, "M n"],
     step: Float[Array, " n"],
     radius: Float[Array, ""],
+    least: Float[Array, ""],
     inside: Callable[[Float[Array, "K n"]], Float[Array, "K n"]],
     count: int,
     turn: Int[Array, ""],
@@ -41,6 +47,7 @@ def beside(
         steps: steps, or a point that teaches the model in place of the first.
         step: that of the model.
         radius: of the region, for a step of no length.
+        least: how far beside a step of little length.
         inside: takes points within the bounds.
         count: how many are evaluated at once.
         turn: how many were evaluated before, for the axes.
@@ -58,7 +65,7 @@ def beside(
     sign = jnp.where(axis // n % 2 == 0, 1, -1).astype(steps.dtype)
     away = sign[:, None] * jax.nn.one_hot(axis % n, n, dtype=steps.dtype)
     length = jnp.linalg.norm(step)
-    length = jnp.where(length > 0, length, radius)
+    length = jnp.maximum(jnp.where(length > 0, length, radius), least)
     forth, back = (inside(step[None] + s * _AWAY * length * away) for s in (1, -1))
     moved = [jnp.linalg.norm(end - step[None], axis=1) for end in (forth, back)]
     ends = jnp.where((2 * moved[0] < moved[1])[:, None], back, forth)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from smoothdiff._products import dot
+from smoothdiff._solvers._at_once import least_length
 from smoothdiff._solvers._least_change import Quadratic
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._ratio_test import TELLING
@@ -50,7 +51,7 @@ def check_step(
         return jnp.sqrt(2 * rise / (jnp.abs(curvature) + tiny))
 
     # the largest parameter moves by the root of its rounding, or more
-    least = jnp.sqrt(eps) * jnp.max(jnp.abs(center)) / metric.widest()
+    least = least_length(center / metric.widest())
     length = jnp.maximum(jnp.maximum(_STEPS * jnp.linalg.norm(step), least), tiny)
     away = model.away / jnp.minimum(jnp.maximum(length, far_enough(mean)), radius)
     # a point that is about as far away tells as much of its direction as curvature would

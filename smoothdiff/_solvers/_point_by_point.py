@@ -167,8 +167,10 @@ class PointStep(eqx.Module):
             moved = (points[0] - params.theta) / jnp.maximum(tolerance, tiny)
             ignored = after.ignored()
             small = solver.norm(params.layout.tree(jnp.where(ignored & ~lower, 0, moved))) < 1
-            # a point that only teaches the model is as long as the radius
+            # a point that only teaches the model is no step, but may show that none is left
+            small &= ~search.checking() | after.right()
             small |= after.right() & ~is_lower(fun, progress.lowest_fun)
+            small |= after.level()
             small &= (solver.rtol > 0) | (solver.atol > 0)
             apart = jnp.where(ignored, jnp.inf, _PLATEAU * rounding)
             small &= after.settled() & ~after.plateau(apart)
@@ -181,9 +183,7 @@ class PointStep(eqx.Module):
         # where a model is wrong, its steps may be short for that: a check comes after the first
         looking = search.is_looking()
         checks = small & (search.small == 0) & ~after.right() & ~looking
-        # points anywhere are no steps
-        teaches = search.checking() | looking
-        after = after.counted(small | looking, teaches, least, sizes.step)
+        after = after.counted(small | looking, search.teaches(), least, sizes.step)
         after = where(checks, after.checked(), after).looking(params, sizes, least)
         # the end of a step that is tried may be anything, and so may a place that nobody asked for
         later = state.restarts < solver.restarts

@@ -34,7 +34,8 @@ class AbstractPointSearch(eqx.Module):
     """Where a search stands: all that was evaluated, and what comes next.
 
     It begins with the `first` points. Where they hardly differ, the `pilot` follows, and the first
-    points again if it found something else. There may be one `look`.
+    points again if it found something else. There may be one `look`. `trust` has a local model, and
+    how far it is trusted.
 
     `evaluated` counts the evaluations, `small` the small steps in a row. The `mark` is the lowest
     value when it last fell noticeably, and `stale` counts the evaluations since.
@@ -52,6 +53,7 @@ class AbstractPointSearch(eqx.Module):
     pilot: Pilot
     average: Average | None
     look: Look | None
+    trust: eqx.AbstractVar[Any]
 
     @abc.abstractmethod
     def widened(
@@ -110,12 +112,16 @@ class AbstractPointSearch(eqx.Module):
     ) -> "AbstractPointSearch":
         """The search with these new evaluations."""
 
-    @abc.abstractmethod
     def settled(self) -> Bool[Array, ""]:
-        """Whether a short step is a sign of convergence."""
+        """Whether a short step is a sign of convergence; the local model's may be none."""
+        return ~self.is_local() | self.trust.settled
 
     def right(self) -> Bool[Array, ""]:
         """Whether the last point was a check, and the local model was right about it."""
+        return self.is_local() & self.trust.right
+
+    def level(self) -> Bool[Array, ""]:
+        """Whether the last step promised no more than rounding, and came to that."""
         return jnp.asarray(False)
 
     def over(self, sizes: Sizes) -> Bool[Array, ""]:
@@ -167,18 +173,22 @@ class AbstractPointSearch(eqx.Module):
 
     def checking(self) -> Bool[Array, ""]:
         """Whether the next evaluation is no step, but checks the local model."""
-        return jnp.asarray(False)
+        return self.is_local() & self.trust.check
 
     def checked(self) -> Any:
-        """With such a check next, if the local model has any."""
-        return self
+        """With such a check next, if the local model is next."""
+        return eqx.tree_at(lambda s: s.trust.check, self, self.is_local())
 
-    def counted(self, small: Array, check: Array, least: Array, count: int) -> Any:
+    def teaches(self) -> Bool[Array, ""]:
+        """Whether the next evaluation is no step, and counts as none."""
+        return self.checking() | self.is_looking()
+
+    def counted(self, small: Array, teaches: Array, least: Array, count: int) -> Any:
         """With a small step more or less, and so many evaluations; `least` is as low as can be.
 
-        A `check` that comes true is no step.
+        What only `teaches` is no step.
         """
-        small = jnp.where(small, jnp.where(check, self.small, self.small + 1), 0)
+        small = jnp.where(small, jnp.where(teaches, self.small, self.small + 1), 0)
         small = jnp.where(least, _SMALL, small)
         counts = self.evaluated + count, small
         counted = eqx.tree_at(lambda s: (s.evaluated, s.small), self, counts)
@@ -213,10 +223,14 @@ class AbstractPointSearch(eqx.Module):
         return self.small >= _SMALL
 
     def plateau(self, reach: Float[Array, " n"]) -> Bool[Array, ""]:
-        """Whether the function is the same as at the best point somewhere further than that."""
-        point, _, fun = self.history.best(self.start)
+        """Whether the function is the same as at the best point somewhere further than that.
+
+        Residuals are, if all of them are: sums of squares are by chance, too.
+        """
+        point, row, _ = self.history.best(self.start)
         away = jnp.any(jnp.abs(self.history.points - point[None]) > reach[None], axis=1)
-        return jnp.any(self.history.valid & (self.history.funs == fun) & away)
+        same = jnp.all(self.history.rows == row[None], axis=1)
+        return jnp.any(self.history.valid & same & away)
 
     def too_near(self, steps: Float[Array, " n"]) -> Bool[Array, " n"]:
         """Parameters whose steps are nothing beside others, and change hardly anything."""

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
 from smoothdiff._products import dot
-from smoothdiff._solvers._at_once import beside, radii
+from smoothdiff._solvers._at_once import beside, least_length, radii
 from smoothdiff._solvers._base import all_finite
 from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._history import History
@@ -67,7 +67,7 @@ class Proposal(NamedTuple):
     rise: Float[Array, ""]
     tight: Bool[Array, ""]
     determined: Bool[Array, ""]
-    lost: Bool[Array, ""]
+    lost: Bool[Array, " M"]
 
 
 class QuadraticTrust(eqx.Module):
@@ -110,7 +110,7 @@ class QuadraticTrust(eqx.Module):
             rise=zeros(),
             tight=no,
             determined=no,
-            lost=no,
+            lost=jnp.zeros(len(radii(self.radius, count)), bool),
         )
 
     def failed(self) -> Bool[Array, ""]:
@@ -192,12 +192,14 @@ class QuadraticTrust(eqx.Module):
         which = jnp.where(check, 2, self.improve.astype(jnp.int32))
         first = jax.lax.switch(which, [lambda: steps[0], other, checked])
         rise = change(first[None], grad, hessian)[0]
-        points, others = beside(steps.at[0].set(first), steps[0], self.radius, inside, count, turn)
+        steps, step = steps.at[0].set(first), steps[0]
+        least = least_length(center / self.metric.widest())
+        points, others = beside(steps, step, self.radius, least, inside, count, turn)
         reduction = reduction.at[0].set(jnp.where(which > 0, 0, reduction[0]))
         poor = (model.farthest > _FAR * self.radius) & (model.used > len(center) + 1)
         # a step that the radius made short may be a first one
-        lost = lost_in_rounding(self.metric.out(first), center, params.sigma)
-        lost &= jnp.linalg.norm(first) < INSIDE * self.radius
+        lost = jax.vmap(lambda s: lost_in_rounding(s, center, params.sigma))(self.metric.out(steps))
+        lost &= jnp.linalg.norm(steps, axis=1) < INSIDE * tried
         said = asked.tight, model.determined, lost
         return Proposal(points, others, reduction, hessian, poor, check, rise, *said)
 
@@ -235,7 +237,8 @@ class QuadraticTrust(eqx.Module):
         # what rounding may do says nothing against the model
         fun, promise = funs[best], proposal.reduction[best]
         unit = jnp.finfo(fun.dtype).eps * jnp.abs(before)
-        little = proposal.lost | ~(promise > unit)
+        lost = proposal.lost[best]
+        little = lost | ~(promise > unit)
         reduction = jnp.where(little, 0, promise)
         hessian = proposal.hessian
         metric, turn = self.metric.adapted(
@@ -265,7 +268,7 @@ class QuadraticTrust(eqx.Module):
         tells = funs[0] - before > TELLING * unit
         tight = proposal.tight & ~self.teaches() & ~(proposal.check & tells)
         radius = jnp.where(tight, 2 * self.radius, radius)
-        ends = settled(self.settled | proposal.lost, outcome, moved, tried[best])
+        ends = settled(self.settled | lost, outcome, moved, tried[best])
         return QuadraticTrust(
             metric=metric,
             radius=radius,

@@ -91,21 +91,21 @@ class ResidualSearch(AbstractPointSearch):
         stage = jnp.full_like(self.stage, FIRST)
         return eqx.tree_at(lambda s: (s.stage, s.start, s.first), self, (stage, theta, first))
 
-    def settled(self) -> Bool[Array, ""]:
-        """The local model's may be none."""
-        return ~self.is_local() | self.trust.settled
+    def teaches(self) -> Bool[Array, ""]:
+        """A look; a check that comes true says as much as a small step."""
+        return self.is_looking()
 
-    def right(self) -> Bool[Array, ""]:
-        """The local model alone has checks."""
-        return self.is_local() & self.trust.right
+    def level(self) -> Bool[Array, ""]:
+        """One of the local model."""
+        return self.is_local() & self.trust.level
 
     def lost(self, sizes: Sizes) -> Bool[Array, ""]:
         """Whether it converged, or so many evaluations in a row were hardly lower."""
         return self.converged() | (self.stale >= sizes.patience)
 
-    def counted(self, small: Array, check: Array, least: Array, count: int) -> "ResidualSearch":
+    def counted(self, small: Array, teaches: Array, least: Array, count: int) -> "ResidualSearch":
         """Before the minimum of a ripple is taken for the answer, wide rounds look around once."""
-        after = super().counted(small, check, least, count)
+        after = super().counted(small, teaches, least, count)
         unseen = (self.wide.rounds == 0) & self.is_local() & self.trust.of_ripple()
         doubt = after.converged() & unseen & self._much() & ~least
         around = after._to_wide(jnp.ones_like(self.wide.scale))

@@ -15,29 +15,23 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._products import dot
-from smoothdiff._solvers._at_once import beside, radii
+from smoothdiff._solvers._at_once import beside, least_length, radii
 from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._nearest_fit import nearest_fit
 from smoothdiff._solvers._ratio_test import (
     INSIDE,
     LEAST,
-    TELLING,
     is_narrow,
     lost_in_rounding,
     ratio_test,
     settled,
     taken_by_rounding,
 )
+from smoothdiff._solvers._residual_check import check_step, checked, newer
 
 # a step is foreseen if the change of the residuals was predicted with an error below this share
 _PREDICTED = 0.5
-# a model is right about a check whose change it predicted with an error below this share
-_RIGHT = 0.1
-# ... after which the next one is so much nearer, as the same would say nothing
-_NEXT = 0.8
-# a check that changes hardly anything is followed by one so many times as far away, within sigma
-_FARTHER = 4.0
 # a model that holds no further than so many sigmas may be that of a ripple
 _RIPPLE = 0.01
 # the radius after a failure, in lengths of the step
@@ -49,6 +43,9 @@ _FAILS, _ROUGH = 8, 2
 _SLOW, _LITTLE = 3, 0.01
 # a reduction is nothing below so many roundings, squared, of the largest loss
 _FLOOR = 100
+# what promises no more than so many roundings of the loss, and comes to that, is neither a failure
+# nor a success
+_ROUNDINGS = 64
 # a step shorter by the first factor should lower the error of the prediction below the second one,
 # or the function is rough
 _SHORTER, _SMOOTH = 0.6, 0.8
@@ -82,8 +79,9 @@ class TrustRegion(eqx.Module):
     one before and predicted no better, as happens where a function jumps, or changed nothing at
     all; `error` and `length` are those of the last one. `worked` says that some step did not fail,
     and `slow` counts the evaluations in a row that lowered the loss by little or nothing, while the
-    radius did not grow. The last step may be `settled`, see there, and the model `right` about a
-    check. `foreseen` is the length of the longest step that held and was foreseen.
+    radius did not grow. The next point may be a `check`. The last step may be `settled`, see there,
+    or `level`: it promised no more than rounding, and came to that; and the model may be `right`
+    about a check. `foreseen` is the length of the longest step that held and was foreseen.
     """
 
     radius: Float[Array, ""]
@@ -95,7 +93,9 @@ class TrustRegion(eqx.Module):
     length: Float[Array, ""]
     worked: Bool[Array, ""]
     slow: Int[Array, ""]
+    check: Bool[Array, ""]
     settled: Bool[Array, ""]
+    level: Bool[Array, ""]
     right: Bool[Array, ""]
     foreseen: Float[Array, ""]
 
@@ -103,9 +103,23 @@ class TrustRegion(eqx.Module):
     def start(radius: Float[Array, ""], n: int, size: int) -> "TrustRegion":
         """Nothing is known of the function."""
         none, zero = jnp.zeros((), jnp.int32), jnp.zeros_like(radius)
-        jacobian = jnp.zeros((n, size), radius.dtype)
         no = jnp.asarray(False)
-        return TrustRegion(radius, jacobian, no, none, none, zero, zero, no, none, no, no, zero)
+        return TrustRegion(
+            radius=radius,
+            jacobian=jnp.zeros((n, size), radius.dtype),
+            improve=no,
+            fails=none,
+            rough=none,
+            error=zero,
+            length=zero,
+            worked=no,
+            slow=none,
+            check=no,
+            settled=no,
+            level=no,
+            right=no,
+            foreseen=zero,
+        )
 
     def nothing(self, count: int) -> Proposal:
         """No steps, where so many other points are evaluated."""
@@ -142,9 +156,9 @@ class TrustRegion(eqx.Module):
         none = jnp.zeros_like(self.fails)
         no, yes = jnp.zeros_like(self.improve), jnp.ones_like(self.worked)
         return eqx.tree_at(
-            lambda t: (t.fails, t.rough, t.slow, t.improve, t.worked),
+            lambda t: (t.fails, t.rough, t.slow, t.improve, t.level, t.right, t.worked),
             self,
-            (none, none, none, no, yes),
+            (none, none, none, no, no, no, yes),
         )
 
     def propose(
@@ -161,9 +175,8 @@ class TrustRegion(eqx.Module):
 
         So many points, after as many evaluations as `turn` says.
         """
-        jacobian, lacking, poor = nearest_fit(
-            history, center, row, sigma, self.radius, self.jacobian
-        )
+        fit = nearest_fit(history, center, row, sigma, self.radius, self.jacobian)
+        jacobian = fit.jacobian
         hessian, grad = dot(jacobian, jacobian.T), dot(jacobian, row)
         tried = jnp.append(radii(self.radius, count), jnp.maximum(self.radius, 1))
         steps = jax.vmap(lambda radius: bounded_step(hessian, grad, radius, *sides))(tried)
@@ -175,21 +188,27 @@ class TrustRegion(eqx.Module):
         steps, change, slope, reduction = (a[:-1] for a in (steps, change, slope, reduction))
         # where the model asks for nothing, a point that teaches it something
         eps = jnp.finfo(row.dtype).eps
-        check = ~(reduction[0] > eps * jnp.sum(row**2))
+        check = self.check | ~(reduction[0] > eps * jnp.sum(row**2))
         improve = self.improve | check
+        farthest = jnp.where(self.check, jnp.maximum(self.radius, 1), self.radius)
+        away = (history.points - center[None]) / sigma[None]
+        telling = check_step(fit, row, center / sigma, farthest)
+        telling = newer(telling, jnp.where(history.valid[:, None], away, 0))
         # to both sides in turns
-        other = _roomy(self.radius * jnp.where(turn % 2 == 0, 1, -1) * lacking, *sides)
+        lacking = self.radius * jnp.where(turn // count % 2 == 0, fit.lacking, -fit.lacking)
+        other = _roomy(jnp.where(check, telling, lacking), *sides)
         first = steps.at[0].set(jnp.where(improve, other, steps[0]))
         change = change.at[0].set(dot(first[0], jacobian))
         low, high = (None if side is None else side[None] for side in sides)
         inside = lambda ends: jnp.clip(ends, low, high)
-        points, others = beside(first, steps[0], self.radius, inside, count, turn)
+        least = least_length(center / sigma)
+        points, others = beside(first, steps[0], self.radius, least, inside, count, turn)
         reduction = reduction.at[0].set(jnp.where(improve, 0, reduction[0]))
         predicted = row[None] + change
         lost = jax.vmap(lambda step: _is_lost(step, center, sigma))(steps)
         # a step that the radius made short may be a first one
         lost &= (jnp.linalg.norm(steps, axis=1) < INSIDE * tried[:-1]) & ~improve
-        said = ahead, jacobian, poor, check, lost
+        said = ahead, jacobian, fit.poor, check, lost
         return Proposal(points, others, predicted, reduction, slope, *said)
 
     def revise(
@@ -212,9 +231,15 @@ class TrustRegion(eqx.Module):
         fun, promise = funs[best], proposal.reduction[best]
         reached = before - fun > LEAST * promise
         lost = proposal.lost[best] & self.settled & jnp.isfinite(fun) & ~reached
-        little = lost | ~(promise > 2 * jnp.finfo(row.dtype).eps * before)
-        reduction = jnp.where(little, 0, promise)
         length: Array = jnp.linalg.norm(proposal.points[best])
+        tested = radii(self.radius, len(funs))
+        rounding = _ROUNDINGS * jnp.finfo(row.dtype).eps * before
+        level = (promise <= rounding) & (jnp.abs(before - fun) <= rounding)
+        level &= ~self.improve & ~proposal.check & (proposal.ahead <= rounding)
+        # a radius below a sigma may be what made the promise small
+        level &= (length < INSIDE * tested[best]) | (self.radius >= 1)
+        little = lost | level | ~(promise > 2 * jnp.finfo(row.dtype).eps * before)
+        reduction = jnp.where(little, 0, promise)
         tiny = jnp.finfo(row.dtype).tiny
         off = jnp.linalg.norm(rows[best] - proposal.predicted[best])
         expected = jnp.linalg.norm(proposal.predicted[best] - row)
@@ -226,7 +251,6 @@ class TrustRegion(eqx.Module):
         promised = outcome.more | (proposal.ahead > taken_by_rounding(before))
         outcome = outcome._replace(more=promised)
         tried, failed, held, long, fails, _ = outcome
-        tested = radii(self.radius, len(funs))
         shorter = (self.fails > 0) & (length < _SHORTER * self.length)
         more = same | (shorter & (error >= _SMOOTH * self.error))
         rough = jnp.where(more, self.rough + 1, self.rough)
@@ -240,10 +264,13 @@ class TrustRegion(eqx.Module):
         radius = jnp.where(failed & ~wait, lower, self.radius)
         # single residuals may jump while the loss comes down as predicted
         radius = jnp.where(held, jnp.maximum(radius, 2 * length), radius)
-        check = self._checked(proposal, row, rows[0], good[0] & compared)
+        asked = proposal.check & good[0] & compared
+        check = checked(row, rows[0], proposal.predicted[0], proposal.ahead, asked)
         after = jnp.minimum(check.factor * radius, jnp.maximum(radius, 1))
-        radius = jnp.where(~tried & ~self.improve & ~lost, after, radius)
-        improve = failed & proposal.poor & ~self.improve
+        radius = jnp.where(tried | self.improve | lost | level | self.check, radius, after)
+        improve = (failed | level) & proposal.poor & ~self.improve & ~self.check
+        faster = (lowest < (1 - _LITTLE) * before) | held | check.right
+        came = self.settled | (level & (fun <= before))
         revised = TrustRegion(
             radius=radius,
             jacobian=proposal.jacobian,
@@ -252,11 +279,11 @@ class TrustRegion(eqx.Module):
             rough=rough.astype(fails.dtype),
             error=jnp.where(failed, error, self.error),
             length=jnp.where(failed, length, self.length),
-            slow=jnp.where(
-                (lowest < (1 - _LITTLE) * before) | held | check.right, 0, self.slow + len(rows)
-            ),
+            slow=jnp.where(faster, 0, jnp.where(level, self.slow, self.slow + len(rows))),
             worked=self.worked | (tried & ~failed),
-            settled=check.right | settled(self.settled, outcome, length, tested[best]),
+            check=jnp.zeros_like(level),
+            settled=check.right | settled(came, outcome, length, tested[best]),
+            level=level,
             right=check.right,
             foreseen=jnp.where(
                 held & (error < _PREDICTED), jnp.maximum(self.foreseen, length), self.foreseen
@@ -264,36 +291,10 @@ class TrustRegion(eqx.Module):
         )
         return revised
 
-    def _checked(
-        self, proposal: Proposal, row: Float[Array, " P"], there: Float[Array, " P"], good: Array
-    ) -> "_Check":
-        """What the residuals `there` say of the model, if they are those of a check.
-
-        A check that changes hardly anything, as predicted, is followed by one farther away, one
-        that the model got wrong by a nearer one. Where the model promises much beyond the radius it
-        has not converged.
-        """
-        predicted, before = proposal.predicted[0], jnp.sum(row**2) / 2
-        off, expected = (jnp.linalg.norm(predicted - a) for a in (there, row))
-        little = TELLING * jnp.finfo(row.dtype).eps * before
-        rise, foreseen = (jnp.sum(a**2) / 2 - before for a in (there, predicted))
-        known = proposal.check & good & (off < _RIGHT * expected)
-        right = known & (rise > little) & ~(proposal.ahead > taken_by_rounding(before))
-        nothing = (jnp.abs(rise) <= little) & (foreseen <= little) & jnp.any(there != row)
-        farther = (proposal.check & good & nothing) | (known & ~right)
-        return _Check(right, jnp.where(right, _NEXT, jnp.where(farther, _FARTHER, 0.5)))
-
 
 def _is_lost(step: Array, center: Array, sigma: Array) -> Array:
     """Whether it is short beside sigma, and of so few roundings that it may come to nothing."""
     return is_narrow(jnp.linalg.norm(step)) & lost_in_rounding(sigma * step, center, sigma)
-
-
-class _Check(NamedTuple):
-    """Whether the model was right, and by what the radius changes."""
-
-    right: Bool[Array, ""]
-    factor: Float[Array, ""]
 
 
 def _roomy(step: Array, low: Array | None, high: Array | None) -> Array:

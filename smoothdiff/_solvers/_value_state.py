@@ -196,22 +196,6 @@ class ValueState(AbstractPointSearch):
         alone = has_box(params) & between & self.trust.failed() & ~self.noisy
         return super().look_due(params, sizes) | alone
 
-    def settled(self) -> Bool[Array, ""]:
-        """The local model's may be none."""
-        return ~self.is_local() | self.trust.settled
-
-    def checking(self) -> Bool[Array, ""]:
-        """The local model alone has checks."""
-        return self.is_local() & self.trust.check
-
-    def checked(self) -> "ValueState":
-        """With a check as the local model's next point."""
-        return eqx.tree_at(lambda s: s.trust.check, self, self.is_local())
-
-    def right(self) -> Bool[Array, ""]:
-        """The local model alone has checks."""
-        return self.is_local() & self.trust.right
-
     def lost(self, sizes: Sizes) -> Bool[Array, ""]:
         """Whether neither model leads anywhere; after one converged the wide one may yet."""
         narrow = is_narrow(self.center.trust.width) & ~self.noisy

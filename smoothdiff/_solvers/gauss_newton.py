@@ -48,9 +48,10 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
       sigma, or within finite bounds points anywhere. Where these find a change, the first points
       are taken again.
     - **The local model** needs one evaluation a step. $y_t$ is the best point. J fits the nearest
-      points, and of all that do it differs least from the last J. The radius $\Delta$ grows if the
-      reduction is as predicted, and shrinks if the loss does not fall. Where J asks for no step, as
-      at the minimum of a fit to noisy data, points beside check it.
+      points. Far ones, where J is off by more than the noise of evaluations, count less. Of all
+      such J it is the one that differs least from the last. The radius $\Delta$
+      grows if the reduction is as predicted, and shrinks if the loss does not fall. Where J asks
+      for a short step or none, as at the minimum of a fit to noisy data, points beside check it.
     - **The wide regression** takes over on functions that jump: when steps fail in a row, when a
       shorter step is predicted no better than a longer one, or when no residual changes. It samples
       rounds of points around a center, which may go uphill, reflected at the bounds:
@@ -70,8 +71,9 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     comes after twice as many evaluations. Where the function takes a key, there are no tests.
 
     Within finite bounds a search that would end with more than a tenth of the loss of its start
-    looks at 2n + 1 points spread over all of the box. Where one is lower, it begins anew. A value
-    that is not finite ends nothing there. Searches that `restarts` add do not look.
+    looks at n + 1 points spread over all of the box, and at n that differ from the best one in one
+    parameter each. Where one is lower, it begins anew. A value that is not finite ends nothing
+    there. Searches that `restarts` add do not look.
 
     With 100 parameters and more, or with a schedule of sigma, each step takes a batch, and there is
     the wide regression alone. A batch may say little about each of so many parameters. Then 12 of
@@ -106,8 +108,11 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         rtol: relative tolerance. The run has converged when three steps in a row are shorter than
             the tolerance, for each parameter atol + rtol max(|y|, sigma), unless only the radius
             made them short, or they failed where the model promised more than rounding may take.
-            After steps that came true none of a few roundings of y fails. A check whose residuals
-            came as predicted counts as such a step. Where no step as long as a hundredth of sigma
+            After steps that came true none of a few roundings of y fails. A step that promises no
+            more than 64 roundings of the loss, and comes to that, counts as a short one. So does a
+            check that comes true. It follows the first short step, and comes where the model asks
+            for nothing: one evaluation where the model is least sure, so far away that the loss
+            should rise by a share of 4e-4. Where no step as long as a hundredth of sigma
             was predicted, and more than a tenth of the first loss is left, that may be a ripple's
             minimum: wide rounds look around first.
         atol: absolute tolerance. With both zero no run converges; else the tolerance is at least
