@@ -149,11 +149,15 @@ def test_functions_that_take_a_key_have_fresh_noise_at_all_levels():
 
         return sd.Level(fun, cost)
 
-    options = {"key": KEY, "takes_key": True, "max_cost": 200}
-    found = sd.coarse_to_fine(sd.least_squares, [level(1.0), level(4.0)], jnp.zeros(2), **options)
-    assert len(found.levels) >= 2
-    assert len(set(map(tuple, keys))) > 20
-    np.testing.assert_allclose(found.y, 1, atol=0.075)
+    levels, off = [level(1.0), level(4.0)], []
+    for seed in range(5):
+        keys.clear()
+        options = {"key": jax.random.key(seed), "takes_key": True, "max_cost": 200}
+        found = sd.coarse_to_fine(sd.least_squares, levels, jnp.zeros(2), **options)
+        assert len(found.levels) >= 2
+        assert len(set(map(tuple, keys))) > 20
+        off.append(np.max(np.abs(found.y - 1)))
+    assert np.median(off) < 0.075
 
 
 @pytest.mark.slow
