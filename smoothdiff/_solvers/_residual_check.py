@@ -91,8 +91,14 @@ def checked(
     """What the residuals `there` say of a model that predicted others.
 
     A check that changes too little to tell, as predicted, is followed by one farther away, one that
-    the model got wrong by a nearer one. Where the model promises much beyond the radius, which is
-    `ahead`, it has not converged.
+    the model got wrong by a nearer one.
+
+    Args:
+        row: the residuals at the center.
+        there: those at the check.
+        predicted: those that the model predicted there.
+        ahead: what it promises beyond the radius: where that is much, nothing has converged.
+        good: whether this was a check, and gave numbers to compare.
     """
     before = jnp.sum(row**2) / 2
     off, expected = (jnp.linalg.norm(predicted - a) for a in (there, row))

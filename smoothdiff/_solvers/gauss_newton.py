@@ -49,9 +49,9 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
       are taken again.
     - **The local model** needs one evaluation a step. $y_t$ is the best point. J fits the nearest
       points. Far ones, where J is off by more than the noise of evaluations, count less. Of all
-      such J it is the one that differs least from the last. The radius $\Delta$
-      grows if the reduction is as predicted, and shrinks if the loss does not fall. Where J asks
-      for a short step or none, as at the minimum of a fit to noisy data, points beside check it.
+      such J it is the one that differs least from the last. The radius $\Delta$ grows if the
+      reduction is as predicted, and shrinks if the loss does not fall. Where J asks for a short
+      step or none, as at the minimum of a fit to noisy data, points beside check it.
     - **The wide regression** takes over on functions that jump: when steps fail in a row, when a
       shorter step is predicted no better than a longer one, or when no residual changes. It samples
       rounds of points around a center, which may go uphill, reflected at the bounds:

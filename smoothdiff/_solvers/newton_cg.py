@@ -67,12 +67,12 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     the wide model alone.
 
     Within finite bounds a search looks once at n + 1 points spread over all of the box, and at n
-    that differ from the best one in one parameter each, or with `restarts` anywhere, too: before it
-    ends, or once its local model has failed and a round has shown no noise. Where one is lower, it
-    begins anew, and may look again. Else it goes on. A value that is not finite ends nothing there.
-    Searches that `restarts` add do not look. Where there is no box and it has converged more than
-    1e5 sigma from the start, it begins anew there once, half as wide as it came far, and looks at
-    one point twice as far away each time: a function that falls for ever has no minimum.
+    that differ from the best one in one parameter each: before it ends, or once its local model has
+    failed and a round has shown no noise. Where one is lower, it begins anew, and may look again.
+    Else it goes on. A value that is not finite ends nothing there. With `restarts` all 2n + 1 are
+    anywhere, and searches that are added do not look. Where there is no box and it has converged
+    more than 1e5 sigma from the start, it begins anew there once, half as wide as it came far, and
+    looks at one point twice as far away each time: a function that falls for ever has no minimum.
 
     Bounds are never left. A sample beyond them is clamped or, where that would throw it out of a
     narrow valley, pulled back along its ray, and the models take it where it was evaluated.
