@@ -191,12 +191,12 @@ class TrustRegion(eqx.Module):
         check = self.check | ~(reduction[0] > eps * jnp.sum(row**2))
         improve = self.improve | check
         farthest = jnp.where(self.check, jnp.maximum(self.radius, 1), self.radius)
-        away = (history.points - center[None]) / sigma[None]
-        telling = check_step(fit, row, center / sigma, farthest)
-        telling = newer(telling, jnp.where(history.valid[:, None], away, 0))
+        away = jnp.where(history.valid[:, None], (history.points - center[None]) / sigma[None], 0)
         # to both sides in turns
         lacking = self.radius * jnp.where(turn // count % 2 == 0, fit.lacking, -fit.lacking)
-        other = _roomy(jnp.where(check, telling, lacking), *sides)
+        telling = lambda: newer(check_step(fit, row, center / sigma, farthest), away)
+        # a check is rare, and takes two decompositions
+        other = _roomy(jax.lax.cond(check, telling, lambda: lacking), *sides)
         first = steps.at[0].set(jnp.where(improve, other, steps[0]))
         change = change.at[0].set(dot(first[0], jacobian))
         low, high = (None if side is None else side[None] for side in sides)
