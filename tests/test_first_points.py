@@ -42,8 +42,18 @@ def linear(slopes):
 def test_a_parameter_of_another_scale_gets_a_nearer_point(count, x64):
     reach, evaluated = measured(linear([1.0, 1e5, -3.0]), count)
     assert sorted(evaluated) == [0, 1, 2, 2, 3]
-    np.testing.assert_array_equal(reach[[0, 2]], 1)
+    # one that comes after it is a little nearer, too
+    np.testing.assert_allclose(reach[[0, 2]], [1, 0.1**0.5 if count == 1 else 1])
     assert reach[1] == pytest.approx(np.linalg.norm(START) / 1e5, rel=0.01)
+
+
+def test_what_is_not_tried_yet_comes_nearer_with_the_others(x64):
+    """Bounds far too wide for all parameters cost one evaluation, not one for each."""
+    reach, evaluated = measured(linear([20.0, 30.0, 40.0]))
+    assert evaluated == [0, 1, 1, 2, 3]
+    np.testing.assert_allclose(reach, np.linalg.norm(START) / 20, rtol=0.1)
+    # but no nearer than three hundredths, however wide they are
+    assert 0.03 <= measured(linear([1e5, 1e5, -0.1]))[0][2] < 0.04
 
 
 def test_where_there_is_no_number_the_next_point_is_a_tenth_as_far(x64):

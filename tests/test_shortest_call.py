@@ -123,6 +123,35 @@ def test_residuals_point_by_point_begin_with_two_fifths_of_a_range(size, bounds,
     np.testing.assert_allclose(found.sigma, np.full(size, sigma), rtol=1e-6)
 
 
+TIMES = np.linspace(0, 4, 20)
+CURVES = {
+    "decay": (lambda a, b, c, t: a * jnp.exp(-b * t) + c, (3.0, 1.5, 0.5)),
+    "logistic": (lambda a, b, c, t: a / (1 + jnp.exp(-b * (t - c))), (5.0, 2.0, 1.5)),
+    "stretched": (lambda a, b, c, t: a * jnp.exp(-((t / b) ** c)), (4.0, 1.2, 0.7)),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("run", [sd.minimise, sd.least_squares])
+def test_bounds_far_too_wide_cost_a_start_nearby_few_evaluations(run, x64):
+    """A twentieth and ten times of the answer, from half to twice of it, until 1e-4 is left."""
+
+    def took(name, seed, bounded):
+        curve, answer = CURVES[name]
+        answer = jnp.array(answer)
+        y0 = answer * jax.random.uniform(jax.random.key(seed), (3,), minval=0.6, maxval=1.6)
+        rows = lambda y, args: curve(*jnp.maximum(y, 1e-3), TIMES) - curve(*answer, TIMES)
+        fun = rows if run is sd.least_squares else lambda y, args: jnp.sum(rows(y, args) ** 2) / 2
+        bounds = (answer / 20, 10 * answer) if bounded else None
+        target = 1e-4 * jnp.sum(rows(y0, None) ** 2) / 2
+        given = {"key": KEY, "target": target, "max_evaluations": 200}
+        return run(fun, y0, bounds=bounds, **given).evaluations
+
+    cases = [(name, seed) for name in CURVES for seed in range(6)]
+    without, within = ([took(*case, bounded) for case in cases] for bounded in (False, True))
+    assert np.median(np.divide(within, without)) < 1.3
+
+
 def test_a_schedule_of_sigma_sets_the_steps_of_many_parameters():
     falls = lambda step: 0.4 / (1 + step)
     options = {"sigma": falls, "max_steps": 3, "keep_iterates": True}

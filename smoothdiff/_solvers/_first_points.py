@@ -2,8 +2,9 @@
 
 Sigma may suit one parameter and be far too large for another. Where the points along a parameter
 say nothing of the slope at the start, nearer ones take their place, and the parameter has so much
-smaller steps from then on. Sigma may also be nothing for a parameter that begins at zero but for
-rounding: a farther point follows.
+smaller steps from then on. Those that come after it begin nearer, too: bounds that are far too wide
+for one parameter mostly are for others. Sigma may also be nothing for a parameter that begins at
+zero but for rounding: a farther point follows.
 """
 
 import dataclasses
@@ -21,6 +22,8 @@ _HIGH = 10.0
 _PLACES, NEARER, _NEAREST = 2 * 4, 0.1, 1e-6
 # where points are nothing beside others they are tried so many times farther
 FARTHER = 100.0
+# for what others told a parameter comes no nearer than this
+CARRIED = 0.03
 # so often a point that fails is evaluated before one that is nearer: it may have failed by chance,
 # and a step that was made short for that takes many evaluations to grow again
 _CALLS = 2
@@ -64,6 +67,10 @@ class FirstPoints(eqx.Module):
     def done(self) -> Bool[Array, ""]:
         """Whether no point is left."""
         return jnp.all(self.left == 0)
+
+    def told(self) -> Bool[Array, " n"]:
+        """Parameters of which no point is left."""
+        return jnp.all(self.left[1:].reshape(len(self.reach), -1) == 0, axis=1)
 
     def next(self, count: int) -> tuple[Int[Array, " K"], Bool[Array, " K"]]:
         """Which points come next, 0 for the start, and which of these places are taken at all."""
@@ -122,4 +129,19 @@ class FirstPoints(eqx.Module):
         along = jnp.where(taken & (at > 0), at - 1, len(self.reach))
         turned = self.turned.at[along].set(was ^ turns, mode="drop")
         left = self.left.at[jnp.where(taken, at, len(self.left))].set(tries, mode="drop")
-        return FirstPoints(self.reach.at[along].multiply(nearer, mode="drop"), turned, left, before)
+        reach = self.reach.at[along].multiply(nearer, mode="drop")
+        # what is not tried yet comes nearer with the others, by what their first try told
+        told = jnp.where(finite & (self.left[at] == _PLACES * _CALLS), nearer, 1)
+        told = jnp.ones_like(reach).at[along].multiply(told, mode="drop")
+        untried = jnp.all(left[1:].reshape(len(reach), -1) == _PLACES * _CALLS, axis=1)
+        carried = jnp.maximum(reach * others_nearer(told, ~untried), jnp.minimum(reach, CARRIED))
+        return FirstPoints(jnp.where(untried, carried, reach), turned, left, before)
+
+
+def others_nearer(told: Float[Array, " n"], tried: Bool[Array, " n"]) -> Float[Array, ""]:
+    """How many times nearer the first points of other parameters come, for what these told now.
+
+    Each time, so that all is the geometric mean of what those told that were tried.
+    """
+    count = jnp.maximum(jnp.sum(tried, dtype=jnp.int32), 1).astype(told.dtype)
+    return jnp.exp(jnp.sum(jnp.log(jnp.maximum(told, NEARER))) / count)

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 from smoothdiff._params import Params
 from smoothdiff._solvers._base import all_finite
 from smoothdiff._solvers._box import bounds_of
-from smoothdiff._solvers._first_points import NEARER, FirstPoints
+from smoothdiff._solvers._first_points import CARRIED, NEARER, FirstPoints, others_nearer
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import differ
 from smoothdiff._solvers._parameter_scan import Scan
@@ -53,7 +53,8 @@ class ValueSearch(ValueState):
             unit = jnp.eye(n, dtype=self.start.dtype)
             sides = jnp.stack([unit, -unit], axis=1).reshape(SIDES * n, n)
             points = self.first.points(sides, lambda: draw(count), count)
-            return self.start[None] + (self.width() * params.sigma)[None] * points, nothing
+            far = self.near * self.width() * params.sigma
+            return self.start[None] + far[None] * points, nothing
 
         def local() -> tuple[Array, Proposal]:
             center, _, fun = self.history.best(self.start)
@@ -92,10 +93,14 @@ class ValueSearch(ValueState):
 
         def first() -> "ValueSearch":
             first = self.first.known(sizes.step)
-            enough = first.done()
+            enough, told = first.done(), first.told()
+            # where they are a sigma away, and not where a scan says
+            now = told & ~self.first.told() & jnp.all(self.first.reach == 1)
+            near = self.near * others_nearer(jnp.where(now, known.nearer(), 1), told)
+            near = jnp.where(enough, 1, jnp.maximum(near, CARRIED))
             stage = jnp.where(enough, TRUST, FIRST).astype(self.stage.dtype)
             turn = Turn.start(len(self.start), known.history.best(self.start)[2])
-            more = dataclasses.replace(known, first=first)
+            more = dataclasses.replace(known, first=first, near=near)
             over = eqx.tree_at(lambda s: (s.stage, s.turn), more, (stage, turn))
             over = where(enough, over.compared(), over).piloting(params)
             return where(enough, more.narrowed(params, over, sizes), over)

@@ -30,6 +30,8 @@ SIDES = 2
 _NEAREST = 1e-5
 # a search of a function without noise ends after so many times its patience without progress
 _PATIENCES = 2
+# a parameter whose start is near its lowest point by chance brings others no nearer than this
+_LEAST_NEAR = 0.25
 # the widths of later searches, in sigma, as powers of ten at random
 _NARROWEST, _WIDEST = -1.5, 0.3
 
@@ -44,13 +46,15 @@ class ValueState(AbstractPointSearch):
     lowest sample: what is lowest by chance does not lead it away from where the smoothed function
     is low. Nor does any search where the function is `noisy`: where it gave another value for the
     same point, which the first round of samples begins with. Parameters are `unchanging` whose
-    first points had the value of the start.
+    first points had the value of the start. First points that are left are so many times as `near`
+    as sigma says.
     """
 
     scan: Scan | None
     searches: Int[Array, ""]
     noisy: Bool[Array, ""]
     unchanging: Bool[Array, " n"]
+    near: Float[Array, ""]
     trust: QuadraticTrust
     place: Float[Array, " n"]
     center: Center
@@ -92,6 +96,7 @@ class ValueState(AbstractPointSearch):
             searches=none,
             noisy=jnp.asarray(False),
             unchanging=jnp.zeros(n, bool),
+            near=jnp.ones_like(never),
             trust=QuadraticTrust.start(sigma, width),
             place=theta,
             center=center,
@@ -143,6 +148,30 @@ class ValueState(AbstractPointSearch):
         # on a plateau nothing is known of any
         unchanging = jnp.any(alone, axis=0) & ~changes & jnp.any(changes)
         return eqx.tree_at(lambda s: s.unchanging, self, unchanging)
+
+    def nearer(self) -> Float[Array, " n"]:
+        r"""How many times nearer the first points of each parameter should have been; one or less.
+
+        Where both are higher than the start, the parabola through all three is lowest at s, in
+        units of how far they are, and four times as far is enough:
+
+        $$ 4 |s|, \quad s = \frac{f_- - f_+}{2 (f_+ + f_- - 2 f_0)} $$
+        """
+        history = self.history
+        alone, here = history.alone(self.start)
+        steps = jnp.where(alone, history.points - self.start[None], 0)
+        rise = jnp.where(alone, (history.funs - history.funs[here])[:, None], 0)
+        higher = (jnp.sum(alone, axis=0) == SIDES) & jnp.all(~alone | (rise > 0), axis=0)
+        higher &= history.valid[here] & jnp.all(history.points[here] == self.start)
+        # each in units of the largest, as powers might overflow; bounds may leave one side shorter
+        most = lambda a: jnp.maximum(jnp.max(jnp.abs(a), axis=0)[None], jnp.finfo(a.dtype).tiny)
+        steps, rise = steps / most(steps), rise / most(rise)
+        moment = lambda power, by: jnp.sum(steps**power * by, axis=0)
+        slope = moment(1, rise) * moment(4, 1.0) - moment(2, rise) * moment(3, 1.0)
+        bend = moment(2, rise) * moment(2, 1.0) - moment(1, rise) * moment(3, 1.0)
+        share = 2 * jnp.abs(slope) / jnp.where(bend > 0, bend, 1)
+        told = higher & (bend > 0) & jnp.isfinite(share)
+        return jnp.where(told, jnp.clip(share, _LEAST_NEAR, 1), 1)
 
     def narrowed(self, params: Params, over: "ValueState", sizes: Sizes) -> "ValueState":
         """What is `over` if the first points tell of each parameter; else those that do not again.

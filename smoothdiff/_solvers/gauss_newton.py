@@ -41,12 +41,13 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
 
     - **The first points** are the start, and one sigma from it along each parameter. Where the loss
       is more than ten times as high there, a nearer point follows, and the width of that parameter
-      shrinks as much. A point that fails is evaluated once more, in case that was chance, before a
-      nearer one. Where the residuals hardly change, and sigma is below a thousandth of the
-      largest, as for a parameter that is zero but for rounding, a farther one follows. If all
-      residuals hardly differ, pairs of points follow, each four times as far away, up to a thousand
-      sigma, or within finite bounds points anywhere. Where these find a change, the first points
-      are taken again.
+      shrinks as much. Those along the parameters that follow come nearer, too, in the geometric
+      mean, but at most to 0.03 sigma. A point that fails is evaluated once more, in case that was
+      chance, before a nearer one. Where the residuals hardly change, and sigma is below a
+      thousandth of the largest, as for a parameter that is zero but for rounding, a farther one
+      follows. If all residuals hardly differ, pairs of points follow, each four times as far away,
+      up to a thousand sigma, or within finite bounds points anywhere. Where these find a change,
+      the first points are taken again.
     - **The local model** needs one evaluation a step. $y_t$ is the best point. J fits the nearest
       points. Far ones, where J is off by more than the noise of evaluations, count less. Of all
       such J it is the one that differs least from the last. The radius $\Delta$ grows if the

@@ -35,10 +35,12 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     $$ \min_p \; g \cdot p + \tfrac12 p \cdot H p, \qquad \|p\|_{M^{-1}} \le \Delta $$
 
     With fewer than 100 parameters the function is evaluated point by point. The first points are
-    the start, and one sigma from it to both sides along each parameter. Where they hardly differ,
+    the start, and one sigma from it to both sides along each parameter. Where both are higher than
+    the start, and the parabola through all three is lowest within a quarter of sigma, those along
+    the parameters that follow come nearer, too: to 0.03 sigma at most. Where all hardly differ,
     pairs of points follow, each four times as far away, up to a thousand sigma, or within finite
-    bounds points anywhere, and then the first points again if these found a change. Then two
-    models take turns, and the one that lowers the function faster goes on:
+    bounds points anywhere, and then the first points again if these found a change. Then two models
+    take turns, and the one that lowers the function faster goes on:
 
     - a local one, around the best point. It interpolates the nearest evaluations, and its Hessian
       differs least from the last one. While they do not determine it, and where they say clearly
