@@ -139,6 +139,18 @@ def test_it_is_stuck_after_five_failures_in_a_row_and_failed_without_a_radius(x6
     assert START(jnp.ones(N), jnp.asarray(1e-16)).failed()
 
 
+def test_it_predicts_once_two_more_steps_came_true_than_did_not(x64):
+    trust, proposal, _, fun = proposal_of(known(around(10)))
+    predicts = []
+    for came_true in (True, True, True, False, False, True):
+        change = float(proposal.reduction[0]) * (-1 if came_true else 1)
+        values = jnp.asarray([fun + change])
+        trust = REVISE(trust, proposal, jnp.asarray(fun), values, jnp.ones(1, bool))
+        predicts.append(bool(trust.predicts()))
+    assert predicts == [False, True, True, True, False, True]
+    assert not trust.revived(jnp.asarray(1.0)).predicts()
+
+
 def test_where_the_model_is_flat_the_step_is_for_the_geometry(x64):
     _, proposal, *_ = proposal_of(known(around(7), lambda x: 1.0), radius=0.5)
     assert proposal.reduction[0] == 0

@@ -43,6 +43,8 @@ _FAR = 2.0
 # so many steps that fail in a row are too many for now, and so many evaluations for each parameter,
 # and one, without a lower point for good
 _FAILS, _SLOW = 5, 10
+# a model of which so many more steps of late came true than not predicts
+_HITS = 2
 # while far points make way for nearer ones, so many failures shrink the radius; none where it is
 # no more than that: there the points, and not the radius, are to blame, unless the value is the
 # same, as on stairs
@@ -74,9 +76,9 @@ class QuadraticTrust(eqx.Module):
     """How far the model is trusted, in units of the metric, and the Hessian of the last model.
 
     The next evaluation is no step where it is to `improve` the geometry of the points, or to
-    `check` the model. `fails` counts the steps in a row
-    that failed, `slow` the evaluations without a lower point. The last step may be `settled`, see
-    there, and the model `right` about a check.
+    `check` the model. `fails` counts the steps in a row that failed, `slow` the evaluations without
+    a lower point, `hits` the steps of late that did not fail, less those that did. The last step
+    may be `settled`, see there, and the model `right` about a check.
     """
 
     metric: Metric
@@ -86,6 +88,7 @@ class QuadraticTrust(eqx.Module):
     check: Bool[Array, ""]
     fails: Int[Array, ""]
     slow: Int[Array, ""]
+    hits: Int[Array, ""]
     settled: Bool[Array, ""]
     right: Bool[Array, ""]
 
@@ -95,7 +98,8 @@ class QuadraticTrust(eqx.Module):
         n, none = len(sigma), jnp.zeros((), jnp.int32)
         hessian = jnp.zeros((n, n), sigma.dtype)
         no = jnp.asarray(False)
-        return QuadraticTrust(Metric.of(sigma, True), radius, hessian, no, no, none, none, no, no)
+        counts = none, none, none
+        return QuadraticTrust(Metric.of(sigma, True), radius, hessian, no, no, *counts, no, no)
 
     def nothing(self, count: int) -> Proposal:
         """No steps, where so many other points are evaluated."""
@@ -122,19 +126,25 @@ class QuadraticTrust(eqx.Module):
         """Whether the model has not predicted for a while; a smaller radius may yet help."""
         return (self.fails >= _FAILS) | self.failed()
 
+    def predicts(self) -> Bool[Array, ""]:
+        """Whether at least half of the steps of late lowered the function."""
+        return self.hits >= _HITS
+
     def teaches(self) -> Bool[Array, ""]:
         """Whether the next evaluation is no step, but to make the model better."""
         return self.improve | self.check
 
     def retried(self) -> "QuadraticTrust":
-        """With the radius as it is, and the failed steps forgotten."""
-        return eqx.tree_at(lambda t: t.fails, self, jnp.zeros_like(self.fails))
+        """With the radius as it is, and what came of steps forgotten."""
+        none = jnp.zeros_like(self.fails)
+        return eqx.tree_at(lambda t: (t.fails, t.hits), self, (none, none))
 
     def revived(self, radius: Float[Array, ""]) -> "QuadraticTrust":
         """Trusted again, at least as far as this, around another point."""
         none = jnp.zeros_like(self.fails)
         radius, no = jnp.maximum(self.radius, radius), jnp.zeros_like(self.improve)
-        return QuadraticTrust(self.metric, radius, self.hessian, no, no, none, none, no, no)
+        counts = none, none, none
+        return QuadraticTrust(self.metric, radius, self.hessian, no, no, *counts, no, no)
 
     def propose(
         self,
@@ -246,6 +256,7 @@ class QuadraticTrust(eqx.Module):
         )
         outcome = ratio_test(before, fun, reduction, self.fails)
         _, failed, held, long, fails, _ = outcome
+        hit = jnp.where(failed, -1, outcome.tried.astype(fails.dtype))
         # a check is no step, but a model that is right about it may have converged
         right = proposal.check & is_right(before, funs[0], proposal.rise)
         usable = all_finite((metric, turn)) & (right | proposal.tight | proposal.determined)
@@ -277,6 +288,7 @@ class QuadraticTrust(eqx.Module):
             check=jnp.zeros_like(self.check),
             fails=fails,
             slow=jnp.where(lowest < before, 0, self.slow + len(funs)).astype(fails.dtype),
+            hits=jnp.clip(self.hits + hit, 0, 2 * _HITS),
             settled=jnp.where(proposal.check, right, ends),
             right=right,
         )

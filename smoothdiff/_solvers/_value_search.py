@@ -30,6 +30,8 @@ from smoothdiff._solvers._where import where
 
 # a first search is long after so many evaluations for each parameter, and one
 _LONG = 60
+# a turn of a local model that predicts is at most so many times as long
+_LONGER = 4
 # so many steps or evaluations that led nowhere are enough for any patience
 _ENOUGH = 2**24
 
@@ -174,8 +176,10 @@ class ValueSearch(ValueState):
         # values with other keys are not to be compared, nor is how fast they fell
         compared = turn.over() & (self.average is None)
         ended = (compared | stuck | (~local & self.center.lost(sizes))) & ~self.later()
-        # a model about to converge goes on, but not once it has: other searches may follow
-        ended &= ~(local & (self.small > 0)) | self.converged()
+        # a model that predicts goes on, but not in a test of it, nor for ever
+        going = self.trust.predicts() & ~turn.test & (turn.spent < _LONGER * turn.length) & ~stuck
+        # so does one about to converge, but not once it has: other searches may follow
+        ended &= ~(local & (going | (self.small > 0))) | self.converged()
 
         # what one has found the other begins with, unless it found little
         revive = ~local & ((lower & self.trust.stuck()) | self._left(point))

@@ -40,7 +40,8 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     the parameters that follow come nearer, too: to 0.03 sigma at most. Where all hardly differ,
     pairs of points follow, each four times as far away, up to a thousand sigma, or within finite
     bounds points anywhere, and then the first points again if these found a change. Then two models
-    take turns, and the one that lowers the function faster goes on:
+    take turns, and the one that lowers the function faster goes on. The local one begins, and goes
+    on while half of its steps lower the function, up to four times as long:
 
     - a local one, around the best point. It interpolates the nearest evaluations, and its Hessian
       differs least from the last one. While they do not determine it, and where they say clearly
