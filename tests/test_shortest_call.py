@@ -147,9 +147,9 @@ def test_bounds_far_too_wide_cost_a_start_nearby_few_evaluations(run, x64):
         given = {"key": KEY, "target": target, "max_evaluations": 200}
         return run(fun, y0, bounds=bounds, **given).evaluations
 
-    cases = [(name, seed) for name in CURVES for seed in range(6)]
+    cases = [(name, seed) for name in CURVES for seed in range(12)]
     without, within = ([took(*case, bounded) for case in cases] for bounded in (False, True))
-    assert np.median(np.divide(within, without)) < 1.3
+    assert np.median(within) < 1.35 * np.median(without)
 
 
 def test_a_schedule_of_sigma_sets_the_steps_of_many_parameters():
