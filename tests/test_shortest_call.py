@@ -137,10 +137,11 @@ def test_bounds_far_too_wide_cost_a_start_nearby_few_evaluations(run, x64):
     """A twentieth and ten times of the answer, from half to twice of it, until 1e-4 is left."""
 
     def took(name, seed, bounded):
-        curve, answer = CURVES[name]
-        answer = jnp.array(answer)
+        curve, found = CURVES[name]
+        answer = jnp.array(found)
         y0 = answer * jax.random.uniform(jax.random.key(seed), (3,), minval=0.6, maxval=1.6)
-        rows = lambda y, args: curve(*jnp.maximum(y, 1e-3), TIMES) - curve(*answer, TIMES)
+        at = lambda y: curve(y[0], y[1], y[2], TIMES)
+        rows = lambda y, args: at(jnp.maximum(y, 1e-3)) - at(answer)
         fun = rows if run is sd.least_squares else lambda y, args: jnp.sum(rows(y, args) ** 2) / 2
         bounds = (answer / 20, 10 * answer) if bounded else None
         target = 1e-4 * jnp.sum(rows(y0, None) ** 2) / 2

@@ -139,9 +139,9 @@ class FirstPoints(eqx.Module):
 
 
 def others_nearer(told: Float[Array, " n"], tried: Bool[Array, " n"]) -> Float[Array, ""]:
-    """How many times nearer the first points of other parameters come, for what these told now.
+    """How far the first points of other parameters are now, as a share, for what these `told`.
 
-    Each time, so that all is the geometric mean of what those told that were tried.
+    All shares together are the geometric mean of what all said that were `tried`.
     """
     count = jnp.maximum(jnp.sum(tried, dtype=jnp.int32), 1).astype(told.dtype)
     return jnp.exp(jnp.sum(jnp.log(jnp.maximum(told, NEARER))) / count)

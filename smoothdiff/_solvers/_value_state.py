@@ -46,8 +46,8 @@ class ValueState(AbstractPointSearch):
     lowest sample: what is lowest by chance does not lead it away from where the smoothed function
     is low. Nor does any search where the function is `noisy`: where it gave another value for the
     same point, which the first round of samples begins with. Parameters are `unchanging` whose
-    first points had the value of the start. First points that are left are so many times as `near`
-    as sigma says.
+    first points had the value of the start. First points that are left are `near` times as far as
+    sigma says.
     """
 
     scan: Scan | None
@@ -150,7 +150,7 @@ class ValueState(AbstractPointSearch):
         return eqx.tree_at(lambda s: s.unchanging, self, unchanging)
 
     def nearer(self) -> Float[Array, " n"]:
-        r"""How many times nearer the first points of each parameter should have been; one or less.
+        r"""How far each parameter's first points should have been, as a share of how far they are.
 
         Where both are higher than the start, the parabola through all three is lowest at s, in
         units of how far they are, and four times as far is enough:
