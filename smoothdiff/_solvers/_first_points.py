@@ -70,7 +70,14 @@ class FirstPoints(eqx.Module):
 
     def told(self) -> Bool[Array, " n"]:
         """Parameters of which no point is left."""
-        return jnp.all(self.left[1:].reshape(len(self.reach), -1) == 0, axis=1)
+        return self._all_have(0)
+
+    def untried(self) -> Bool[Array, " n"]:
+        """Parameters of which no point was evaluated."""
+        return self._all_have(_PLACES * _CALLS)
+
+    def _all_have(self, calls: int) -> Bool[Array, " n"]:
+        return jnp.all(self.left[1:].reshape(len(self.reach), -1) == calls, axis=1)
 
     def next(self, count: int) -> tuple[Int[Array, " K"], Bool[Array, " K"]]:
         """Which points come next, 0 for the start, and which of these places are taken at all."""
@@ -130,18 +137,24 @@ class FirstPoints(eqx.Module):
         turned = self.turned.at[along].set(was ^ turns, mode="drop")
         left = self.left.at[jnp.where(taken, at, len(self.left))].set(tries, mode="drop")
         reach = self.reach.at[along].multiply(nearer, mode="drop")
-        # what is not tried yet comes nearer with the others, by what their first try told
-        told = jnp.where(finite & (self.left[at] == _PLACES * _CALLS), nearer, 1)
-        told = jnp.ones_like(reach).at[along].multiply(told, mode="drop")
-        untried = jnp.all(left[1:].reshape(len(reach), -1) == _PLACES * _CALLS, axis=1)
-        carried = jnp.maximum(reach * others_nearer(told, ~untried), jnp.minimum(reach, CARRIED))
-        return FirstPoints(jnp.where(untried, carried, reach), turned, left, before)
+        tried = FirstPoints(reach, turned, left, before)
+        # what is not tried yet comes nearer with the others, by what their first try said
+        said = jnp.where(finite & (self.left[at] == _PLACES * _CALLS), nearer, 1)
+        said = jnp.ones_like(reach).at[along].multiply(said, mode="drop")
+        untried = tried.untried()
+        carried = jnp.maximum(reach * others_nearer(said, ~untried), jnp.minimum(reach, CARRIED))
+        return dataclasses.replace(tried, reach=jnp.where(untried, carried, reach))
 
 
-def others_nearer(told: Float[Array, " n"], tried: Bool[Array, " n"]) -> Float[Array, ""]:
-    """How far the first points of other parameters are now, as a share, for what these `told`.
+def others_nearer(said: Float[Array, " n"], tried: Bool[Array, " n"]) -> Float[Array, ""]:
+    """How many times as far the points of parameters not tried yet should be; one or less.
 
-    All shares together are the geometric mean of what all said that were `tried`.
+    The product of what this returns, call by call, is the geometric mean of what was said.
+
+    Args:
+        said: how many times as far each parameter's points should have been; one, if it said
+            nothing, or before this call.
+        tried: which parameters have said something by now.
     """
-    count = jnp.maximum(jnp.sum(tried, dtype=jnp.int32), 1).astype(told.dtype)
-    return jnp.exp(jnp.sum(jnp.log(jnp.maximum(told, NEARER))) / count)
+    count = jnp.maximum(jnp.sum(tried, dtype=jnp.int32), 1).astype(said.dtype)
+    return jnp.exp(jnp.sum(jnp.log(jnp.maximum(said, NEARER))) / count)

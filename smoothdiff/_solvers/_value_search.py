@@ -96,7 +96,7 @@ class ValueSearch(ValueState):
         def first() -> "ValueSearch":
             first = self.first.known(sizes.step)
             enough, told = first.done(), first.told()
-            # where they are a sigma away, and not where a scan says
+            # a scan has said how far, and a retry, too: there reach is not one
             now = told & ~self.first.told() & jnp.all(self.first.reach == 1)
             near = self.near * others_nearer(jnp.where(now, known.nearer(), 1), told)
             near = jnp.where(enough, 1, jnp.maximum(near, CARRIED))
