@@ -1,13 +1,13 @@
 """What is chosen where the user chooses nothing: the solver and its sigma."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax.typing import ArrayLike
 from jaxtyping import Array, PyTree
 
 from smoothdiff._numbers import check_real
@@ -28,6 +28,9 @@ from smoothdiff._support import MovingSupport, as_support
 _SHARE, _ALIKE = 0.2, 10.0
 # and of a range for residuals that are evaluated point by point: first points far apart tell most
 _WIDE = 0.4
+# but where a parameter starts within so much of the range from its end, the range is wide beside
+# what is known: sigma is smaller by the root of that share, at most so many times
+_EDGE, _LEAST = 0.1, 0.25
 # a step of Adam, in sigmas
 _RATE = 0.15
 # searches that may follow until a target is reached: more than any limit allows
@@ -37,11 +40,16 @@ _FEW = 10
 
 
 def share_of_range(
-    y: PyTree[Array], residuals: bool, support: Callable[[PyTree], Array] | None = None
-) -> float:
-    """The default sigma as a share of a range."""
-    by_points = residuals and support is None and GaussNewton(1.0).sizes(y) is not None
-    return _WIDE if by_points else SIGMA
+    y: PyTree[Array],
+    bounds: tuple[PyTree, PyTree] | None,
+    residuals: bool,
+    support: Callable[[PyTree], Array] | None = None,
+) -> PyTree:
+    """The default sigma of each parameter as a share of its range."""
+    leaves, treedef = jax.tree.flatten(y)
+    if not residuals or support is not None or GaussNewton(1.0).sizes(y) is None:
+        return treedef.unflatten([SIGMA] * len(leaves))
+    return treedef.unflatten(map(_wide, leaves, *_sides(y, bounds)))
 
 
 def default_solver(
@@ -60,7 +68,7 @@ def default_solver(
     left out, as nobody chose where the points are.
     """
     all_bounded = _all_bounded(y, bounds)
-    usual = _usual(y, bounds, share_of_range(y, residuals, support))
+    usual = _usual(y, bounds, share_of_range(y, bounds, residuals, support))
     if sigma is None:
         sigma = usual
     elif not callable(sigma):
@@ -86,10 +94,11 @@ def default_solver(
     return FirstOrder(optim, sigma, adaptive=not callable(sigma), nonfinite="drop")
 
 
-def _usual(y: PyTree[Array], bounds: tuple[PyTree, PyTree] | None, share: float) -> PyTree[Array]:
-    """A share of each range; without one a fifth of the parameter's scale."""
+def _usual(y: PyTree[Array], bounds: tuple[PyTree, PyTree] | None, share: PyTree) -> PyTree[Array]:
+    """These shares of each range; without one a fifth of the parameter's scale."""
     leaves, treedef = jax.tree.flatten(y)
-    return treedef.unflatten(map(partial(_width, share), leaves, *_sides(y, bounds)))
+    shares = treedef.flatten_up_to(share)
+    return treedef.unflatten(map(_width, leaves, shares, *_sides(y, bounds)))
 
 
 def _sides(y: PyTree[Array], bounds: tuple[PyTree, PyTree] | None) -> tuple[list, list]:
@@ -140,12 +149,23 @@ def _in_sigmas(sigma: PyTree) -> optax.GradientTransformation:
     return optax.stateless(update)
 
 
-def _width(share: float, leaf: Array, low: Any, high: Any) -> Array:
+def _width(leaf: Array, share: ArrayLike, low: Any, high: Any) -> Array:
     width = jnp.asarray(_SHARE * _sizes(np.asarray(leaf)), leaf.dtype)
     if low is None or high is None:
         return width
     span = jnp.broadcast_to(jnp.asarray(high) - jnp.asarray(low), leaf.shape).astype(leaf.dtype)
     return jnp.where(jnp.isfinite(span) & (span > 0), share * span, width)
+
+
+def _wide(leaf: Array, low: Any, high: Any) -> np.ndarray | float:
+    """The share for residuals, less where the start is near an end."""
+    if low is None or high is None:
+        return _WIDE
+    y, low, high = (np.asarray(a, float) for a in (leaf, low, high))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        inside = np.minimum(y - low, high - y) / (high - low)
+    near = np.clip(np.sqrt(np.maximum(inside, 0) / _EDGE), _LEAST, 1)
+    return _WIDE * np.where(np.isfinite(inside), near, 1)
 
 
 def _sizes(leaf: np.ndarray) -> np.ndarray:

@@ -85,7 +85,7 @@ class Range(AbstractSpace):
         """Zero and one."""
         return 0.0, 1.0
 
-    def _default_width(self, share: float) -> float:
+    def _default_width(self, share: Any) -> Any:
         return share
 
     @property
@@ -192,7 +192,7 @@ class Integer(AbstractSpace):
         """How many numbers there are."""
         return np.asarray(np.subtract(self.high, self.low) + 1)
 
-    def _default_width(self, share: float) -> Any:
+    def _default_width(self, share: Any) -> Any:
         return np.maximum(share, 0.5 / self.count())
 
     def _check_dtype(self, dtype: np.dtype, name: str) -> None:

@@ -140,7 +140,7 @@ def recommend(
     y = jax.tree.map(inexact, y0)
     squares, spent = _residuals(fun, y, args)
     if space is not None and sigma is None:
-        sigma = units.sigma(share_of_range(y, squares))
+        sigma = units.sigma(share_of_range(y, bounds, squares))
     solver = default_solver(y, bounds, sigma, squares)
     params = take_apart(y, solver.sigma, bounds)
     n = params.theta.size

@@ -90,7 +90,7 @@ class Search:
         if (units := self._units) is not None:
             bounds = units.bounds()
             if solver is None and sigma is None:
-                sigma = units.sigma(share_of_range(units.unit(y0), residuals))
+                sigma = units.sigma(share_of_range(units.unit(y0), bounds, residuals))
         self._y = brought(self._unit(y0))
         if solver is None:
             solver = default_solver(self._y, bounds, sigma, residuals)

@@ -89,7 +89,7 @@ def solve(
     if solver is None:
         residuals = kind.solvers is optx.AbstractLeastSquaresSolver
         if space is not None and sigma is None:
-            sigma = units.sigma(share_of_range(y, residuals, support))
+            sigma = units.sigma(share_of_range(y, bounds, residuals, support))
         until = limits[-1] is not None and not takes_key
         solver = default_solver(y, bounds, sigma, residuals, support, anywhere, until)
     else:

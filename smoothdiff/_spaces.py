@@ -67,11 +67,12 @@ class AbstractSpace(abc.ABC):
         if self.label is not None and not isinstance(self.label, str):
             object.__setattr__(self, "label", _tuples(np.asarray(self.label, str).tolist()))
 
-    def width(self, share: float = SIGMA) -> Any:
+    def width(self, share: Any = SIGMA) -> Any:
         """The smoothing width in unit coordinates.
 
         Args:
-            share: of a range, where sigma was left out.
+            share: of a range, where sigma was left out; a number, or one for each number of the
+                parameter.
 
         Returns:
             Sigma, or the default: a number, or one for each number of the parameter.
@@ -137,7 +138,7 @@ class AbstractSpace(abc.ABC):
                 "in float64, or in other units"
             )
 
-    def _default_width(self, share: float) -> Any:
+    def _default_width(self, share: Any) -> Any:
         del share  # of a range, which this is not
         return SIGMA
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import Literal
+from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -125,7 +125,7 @@ class Positive(AbstractSpace):
     def _scale(self, like: Array) -> Array:
         return fit(1.0 if self.scale is None else self.scale, like)
 
-    def _default_width(self, share: float) -> float:
+    def _default_width(self, share: Any) -> float:
         del share
         return math.log(2)
 
@@ -195,7 +195,7 @@ class Periodic(AbstractSpace):
         u = floating(u)
         return fit(self.low, u) + fit(self.period, u) * u
 
-    def _default_width(self, share: float) -> float:
+    def _default_width(self, share: Any) -> float:
         del share
         return SIGMA / 2
 

@@ -104,13 +104,20 @@ class UnitSpace:
             counts += np.broadcast_to(space.count(), shape).reshape(-1).tolist()
         return math.prod(counts)
 
-    def sigma(self, share: float = SIGMA) -> PyTree:
+    def sigma(self, share: PyTree | None = None) -> PyTree:
         """The smoothing width in unit coordinates, None where there is no space to say it.
 
         Args:
-            share: of each range whose space does not say its own.
+            share: of each range whose space does not say its own, like the parameters; by default
+                a fifth.
         """
-        widths = [None if s is None else np.asarray(s.width(share), float) for s in self.spaces]
+        count = len(self.spaces)
+        shares = [SIGMA] * count if share is None else self.treedef.flatten_up_to(share)
+        width = lambda space, part: np.asarray(space.width(part), float)
+        widths = [
+            None if space is None else width(space, part)
+            for space, part in zip(self.spaces, shares, strict=True)
+        ]
         return self.treedef.unflatten(widths)
 
     def labels(self) -> list[str]:

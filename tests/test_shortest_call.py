@@ -167,12 +167,37 @@ def test_a_schedule_of_sigma_sets_the_steps_of_many_parameters():
 def test_a_space_and_the_same_bounds_have_one_default(run, width, own):
     low, high = jnp.array([-1.0, 0.0]), jnp.array([1.0, 4.0])
     fun = (lambda y, _: y) if run is sd.least_squares else (lambda y, _: jnp.sum(y**2))
-    call = lambda **where: run(fun, jnp.ones(2), key=KEY, max_steps=1, **where).solver.sigma
+    y0 = jnp.array([0.0, 1.0])
+    call = lambda **where: run(fun, y0, key=KEY, max_steps=1, **where).solver.sigma
     found = call(space=sd.Range(low, high, sigma=own))
     np.testing.assert_allclose(found, np.full(2, own or width), rtol=1e-6)
     if own is None:
         bounded = call(bounds=(low, high)) / (high - low)
         np.testing.assert_allclose(bounded, np.full(2, width), rtol=1e-6)
+
+
+@pytest.mark.parametrize("space", [True, False])
+def test_residuals_from_near_an_end_of_a_range_begin_with_less_of_it(space):
+    """The root of a start's distance from the end, within a tenth of the range; at least a quarter.
+
+    A sigma that is given, by the space or the call, is as it is given.
+    """
+    low, high = jnp.zeros(5), jnp.full(5, 10.0)
+    y0 = jnp.array([5.0, 1.0, 9.75, 0.01, 0.0])
+    where = {"space": sd.Range(low, high)} if space else {"bounds": (low, high)}
+    call = lambda **more: (
+        sd.least_squares(lambda y, _: y, y0, key=KEY, max_steps=1, **(where | more)).solver.sigma
+    )
+    scale = 1 if space else 10
+    expected = 0.4 * np.array([1, 1, 0.5, 0.25, 0.25])
+    np.testing.assert_allclose(call() / scale, expected, rtol=1e-5)
+    np.testing.assert_allclose(call(sigma=0.3), 0.3, rtol=1e-6)
+    if space:
+        own = call(space=sd.Range(low, high, sigma=0.3))
+        np.testing.assert_allclose(own, np.full(5, 0.3), rtol=1e-6)
+    # numbers are looked at by another solver
+    number = sd.minimise(lambda y, _: jnp.sum(y**2), y0, key=KEY, max_steps=1, **where)
+    np.testing.assert_allclose(number.solver.sigma / scale, np.full(5, 0.2), rtol=1e-6)
 
 
 @pytest.mark.slow

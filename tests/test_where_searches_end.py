@@ -14,6 +14,7 @@ from smoothdiff._solvers._history import History
 from smoothdiff._solvers._ratio_test import is_lower, rounding_alone
 from smoothdiff._solvers._residual_search import ResidualSearch
 
+KEY = jax.random.key(0)
 PIXELS = np.linspace(0, 1, 32)
 
 
@@ -210,6 +211,31 @@ def test_a_fit_ends_soon_after_rounding_is_all_that_is_left():
         np.testing.assert_allclose(result.y, [2.0, 0.7], rtol=1e-6)
         reached = np.argmax(np.array(seen) <= 1e-6 * seen[0])
         assert 5 < reached < len(seen) <= reached + 12
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_a_fit_that_leaves_nothing_ends_at_once(dtype, x64):
+    """A short step that leaves 1e-20 of what is usual is the last one; in float32 1e-10.
+
+    Not if no tolerance was given.
+    """
+    left = 1e-10 if dtype == jnp.float32 else 1e-20
+    times = jnp.asarray(TIMES, dtype)
+    curve = lambda y: y[0] / (1 + y[1] * times) + y[2] * jnp.sin(times)
+    residuals = lambda y, args: curve(y) - curve(jnp.array([2, 0.7, 1], dtype))
+
+    def run(seed, **settings):
+        y0 = jax.random.uniform(jax.random.key(seed), (3,), dtype, 0.5, 1.5)
+        solver = sd.GaussNewton(0.2, **settings)
+        result = sd.least_squares(residuals, y0, key=KEY, solver=solver, max_evaluations=60)
+        lowest = np.minimum.accumulate([record.fun for record in result.history])
+        return result, np.sum(lowest < left / 10 * lowest[0])
+
+    for seed in range(6):
+        result, after = run(seed)
+        assert result.reason == "converged"
+        assert after <= 4
+    assert run(0, rtol=0.0)[0].evaluations == 60
 
 
 def test_a_wrong_model_that_asks_for_a_tiny_step_has_not_converged():

@@ -36,6 +36,9 @@ from smoothdiff._solvers._where import where
 _PATIENCE, _STEPS = 20, 5
 # values that are the same at points further apart than so many roots of the rounding: a plateau
 _PLATEAU = 3
+# a loss is nothing if it is so small beside the highest of those that are known, but for a quarter
+# of them, which may be beyond all measure
+_MOST, _NOTHING = 0.75, {"float32": 1e-10, "float64": 1e-20}
 # of the last evaluations, at least so many, one must be finite where others may be dropped
 _ENOUGH = 10
 
@@ -63,6 +66,12 @@ class PointState(eqx.Module):
 def patience(n: int, num_samples: int | None) -> int:
     """The default, in evaluations."""
     return max(_PATIENCE * (n + 1), _STEPS * (num_samples or 1))
+
+
+def _is_nothing(fun: Float[Array, ""], history: History) -> Bool[Array, ""]:
+    """Whether a loss is nothing beside others, so that short steps need no check."""
+    known = jnp.where(history.valid, history.funs, jnp.nan)
+    return fun <= _NOTHING[fun.dtype.name] * jnp.nanquantile(known, _MOST)
 
 
 def final_evaluations(candidates: int) -> int:
@@ -167,19 +176,24 @@ class PointStep(eqx.Module):
             moved = (points[0] - params.theta) / jnp.maximum(tolerance, tiny)
             ignored = after.ignored()
             small = solver.norm(params.layout.tree(jnp.where(ignored & ~lower, 0, moved))) < 1
+            few = small & ~search.teaches()
             # a point that only teaches the model is no step, but may show that none is left
             small &= ~search.checking() | after.right()
             small |= after.right() & ~is_lower(fun, progress.lowest_fun)
             small |= after.level()
-            small &= (solver.rtol > 0) | (solver.atol > 0)
+            asked = (solver.rtol > 0) | (solver.atol > 0)
+            small &= asked
             apart = jnp.where(ignored, jnp.inf, _PLATEAU * rounding)
             small &= after.settled() & ~after.plateau(apart)
             small &= after.average is None
         # squares so small that all sums are zero say nothing
         nothing = jnp.all(after.history.funs == 0) & jnp.any(rows != 0) & solver.squares
         small &= ~nothing
-        least = (jnp.minimum(fun, progress.lowest_fun) == 0) & solver.squares & ~nothing
-        least &= after.average is None
+        least = jnp.asarray(False)
+        if solver.squares and after.average is None:
+            below = jnp.minimum(fun, progress.lowest_fun)
+            least = (below == 0) | (few & asked & _is_nothing(below, after.history))
+            least &= ~nothing
         # where a model is wrong, its steps may be short for that: a check comes after the first
         looking = search.is_looking()
         checks = small & (search.small == 0) & ~after.right() & ~looking
