@@ -1,7 +1,6 @@
 """The loop around searches that evaluate a function point by point: bounds, noise, restarts."""
 
 import dataclasses
-import math
 from functools import partial
 from typing import Any
 
@@ -16,29 +15,23 @@ from smoothdiff._samplers import Sobol
 from smoothdiff._seen import Seen, kept, lowest
 from smoothdiff._solvers._base import (
     Progress,
-    promotion,
     read_options,
     smoothed_params,
 )
 from smoothdiff._solvers._box import anywhere, bounded
+from smoothdiff._solvers._convergence import signs
 from smoothdiff._solvers._evaluator import Evaluator, objectives
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import Contest, Values, evaluated, judging
 from smoothdiff._solvers._look import Look
-from smoothdiff._solvers._point_search import AbstractPointSearch
+from smoothdiff._solvers._looking_search import AbstractLookingSearch
 from smoothdiff._solvers._random_numbers import in_step, takes_key
-from smoothdiff._solvers._ratio_test import is_lower, taken_by_rounding
 from smoothdiff._solvers._stages import Sizes
 from smoothdiff._solvers._where import where
 
 # by default a search ends after so many evaluations for each parameter, and one, that hardly
 # lowered the function, but after no fewer steps than that
 _PATIENCE, _STEPS = 20, 5
-# values that are the same at points further apart than so many roots of the rounding: a plateau
-_PLATEAU = 3
-# a loss is nothing if it is so small beside the highest of those that are known, but for a quarter
-# of them, which may be beyond all measure
-_MOST, _NOTHING = 0.75, {"float32": 1e-10, "float64": 1e-20}
 # of the last evaluations, at least so many, one must be finite where others may be dropped
 _ENOUGH = 10
 
@@ -52,7 +45,7 @@ class PointState(eqx.Module):
     """
 
     progress: Progress
-    search: AbstractPointSearch
+    search: AbstractLookingSearch
     restarts: Array
     found: History | None
     aux: PyTree[Array]
@@ -68,12 +61,6 @@ def patience(n: int, num_samples: int | None) -> int:
     return max(_PATIENCE * (n + 1), _STEPS * (num_samples or 1))
 
 
-def _is_nothing(fun: Float[Array, ""], history: History) -> Bool[Array, ""]:
-    """Whether a loss is nothing beside others, so that short steps need no check."""
-    known = jnp.where(history.valid, history.funs, jnp.nan)
-    return fun <= _NOTHING[fun.dtype.name] * jnp.nanquantile(known, _MOST)
-
-
 def final_evaluations(candidates: int) -> int:
     """The best point again, and so many candidates of the search; with noise the start as well."""
     return judging(0, new=candidates, old=1)
@@ -82,7 +69,7 @@ def final_evaluations(candidates: int) -> int:
 def init(
     solver: Any,
     y: PyTree[Array],
-    search: AbstractPointSearch,
+    search: AbstractLookingSearch,
     options: dict[str, Any],
     aux_struct: PyTree,
 ) -> PointState:
@@ -146,13 +133,13 @@ class PointStep(eqx.Module):
         rows: Float[Array, "K P"],
         proposal: Any,
         stage: int | None = None,
-    ) -> AbstractPointSearch:
+    ) -> AbstractLookingSearch:
         """The search with what the function returned at these points."""
         new = self._new(points, rows)
         return self.state.search.after(self.params(), new, proposal, self.sizes, stage)
 
     def counted(
-        self, points: Float[Array, "K n"], rows: Float[Array, "K P"], after: AbstractPointSearch
+        self, points: Float[Array, "K n"], rows: Float[Array, "K P"], after: AbstractLookingSearch
     ) -> tuple[PyTree[Array], PointState]:
         """The iterate and the state with that search, or with another one if it is over."""
         solver, sizes, state, params = self.solver, self.sizes, self.state, self.params()
@@ -162,38 +149,9 @@ class PointStep(eqx.Module):
         theta, width = after.iterate(), after.width()
         new_y = params.layout.tree(theta)
         point, fun = lowest(points, jnp.where(good, funs, jnp.inf))
-        lower = fun < progress.lowest_fun
-        with promotion():
-            # parameters in one array may have very different units
-            scale = jnp.maximum(jnp.abs(params.theta), params.sigma)
-            rounding = math.sqrt(jnp.finfo(theta.dtype).eps) * scale
-            # it has not converged while the function falls by more than rounding
-            falls = progress.lowest_fun - fun > taken_by_rounding(progress.lowest_fun)
-            least_move = jnp.where(falls, 0, rounding)
-            tolerance = jnp.maximum(solver.atol + solver.rtol * scale, least_move)
-            tiny = jnp.finfo(theta.dtype).tiny
-            # of steps at several radii the first is that of the model
-            moved = (points[0] - params.theta) / jnp.maximum(tolerance, tiny)
-            ignored = after.ignored()
-            small = solver.norm(params.layout.tree(jnp.where(ignored & ~lower, 0, moved))) < 1
-            few = small & ~search.teaches()
-            # a point that only teaches the model is no step, but may show that none is left
-            small &= ~search.checking() | after.right()
-            small |= after.right() & ~is_lower(fun, progress.lowest_fun)
-            small |= after.level()
-            asked = (solver.rtol > 0) | (solver.atol > 0)
-            small &= asked
-            apart = jnp.where(ignored, jnp.inf, _PLATEAU * rounding)
-            small &= after.settled() & ~after.plateau(apart)
-            small &= after.average is None
-        # squares so small that all sums are zero say nothing
-        nothing = jnp.all(after.history.funs == 0) & jnp.any(rows != 0) & solver.squares
-        small &= ~nothing
-        least = jnp.asarray(False)
-        if solver.squares and after.average is None:
-            below = jnp.minimum(fun, progress.lowest_fun)
-            least = (below == 0) | (few & asked & _is_nothing(below, after.history))
-            least &= ~nothing
+        small, least = signs(
+            solver, params, search, after, (points, rows, fun), progress.lowest_fun
+        )
         # where a model is wrong, its steps may be short for that: a check comes after the first
         looking = search.is_looking()
         checks = small & (search.small == 0) & ~after.right() & ~looking
@@ -227,8 +185,8 @@ class PointStep(eqx.Module):
         return new_y, PointState(progress, after, restarts, found, state.aux)
 
     def _anew(
-        self, progress: Progress, before: AbstractPointSearch
-    ) -> tuple[PyTree[Array], AbstractPointSearch, History | None]:
+        self, progress: Progress, before: AbstractLookingSearch
+    ) -> tuple[PyTree[Array], AbstractLookingSearch, History | None]:
         """The iterate and the state of another search, and the history of the lowest before it."""
         params = self.params()
         lowest_theta = params.layout.vector(jax.tree.leaves(progress.lowest_y))
@@ -309,7 +267,7 @@ class PointStep(eqx.Module):
         return smoothed, unknown, Seen(y, jnp.full_like(unknown, jnp.inf))
 
 
-def _samples(solver: Any, key: Array, search: AbstractPointSearch, count: int) -> Array:
+def _samples(solver: Any, key: Array, search: AbstractLookingSearch, count: int) -> Array:
     """Standard normal points for a round."""
     return _normal_points(solver, jax.random.fold_in(key, search.seed()), count, search.start)
 

@@ -19,8 +19,8 @@ from jaxtyping import Array, Bool, Float, Int
 from smoothdiff._params import Params
 from smoothdiff._solvers._first_points import FARTHER, FirstPoints
 from smoothdiff._solvers._history import History, alike
+from smoothdiff._solvers._looking_search import AbstractLookingSearch
 from smoothdiff._solvers._pilot import Pilot
-from smoothdiff._solvers._point_search import AbstractPointSearch
 from smoothdiff._solvers._residual_trust import Proposal, TrustRegion
 from smoothdiff._solvers._stages import FIRST, TRUST, WIDE, Sizes, by_stage
 from smoothdiff._solvers._turns import Turn
@@ -33,7 +33,7 @@ _NARROWER = 0.1
 _MUCH = 0.1
 
 
-class ResidualSearch(AbstractPointSearch):
+class ResidualSearch(AbstractLookingSearch):
     """Where a search stands, with the local model and the wide one."""
 
     trust: TrustRegion

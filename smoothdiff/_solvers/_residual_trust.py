@@ -102,8 +102,7 @@ class TrustRegion(eqx.Module):
     @staticmethod
     def start(radius: Float[Array, ""], n: int, size: int) -> "TrustRegion":
         """Nothing is known of the function."""
-        none, zero = jnp.zeros((), jnp.int32), jnp.zeros_like(radius)
-        no = jnp.asarray(False)
+        none, zero, no = jnp.zeros((), jnp.int32), jnp.zeros_like(radius), jnp.asarray(False)
         return TrustRegion(
             radius=radius,
             jacobian=jnp.zeros((n, size), radius.dtype),
@@ -245,23 +244,21 @@ class TrustRegion(eqx.Module):
         expected = jnp.linalg.norm(proposal.predicted[best] - row)
         error = off / jnp.maximum(expected, tiny)
         error = jnp.asarray(jnp.where(jnp.isfinite(fun), error, jnp.inf))
-        same = jnp.all(rows[best] == row)
         outcome = ratio_test(before, fun, reduction, self.fails)
         # what is far ahead of a radius that failures made small has not converged
         promised = outcome.more | (proposal.ahead > taken_by_rounding(before))
         outcome = outcome._replace(more=promised)
         tried, failed, held, long, fails, _ = outcome
         shorter = (self.fails > 0) & (length < _SHORTER * self.length)
-        more = same | (shorter & (error >= _SMOOTH * self.error))
+        more = jnp.all(rows[best] == row) | (shorter & (error >= _SMOOTH * self.error))
         rough = jnp.where(more, self.rough + 1, self.rough)
         rough = jnp.where(tried & ~failed, 0, jnp.where(failed & ~long, rough, self.rough))
         # the lowest point of the parabola through both values and the slope
         slope = proposal.slope[best]
         share = slope / jnp.maximum(2 * (fun - before + slope), tiny)
         share = jnp.clip(jnp.where(jnp.isfinite(fun), share, 0), _SMALLEST, _LARGEST)
-        lower = jnp.minimum(self.radius, length) * share
         wait = proposal.poor & (fails < 2) & ~self.improve & ~long
-        radius = jnp.where(failed & ~wait, lower, self.radius)
+        radius = jnp.where(failed & ~wait, jnp.minimum(self.radius, length) * share, self.radius)
         # single residuals may jump while the loss comes down as predicted
         radius = jnp.where(held, jnp.maximum(radius, 2 * length), radius)
         asked = proposal.check & good[0] & compared
@@ -271,7 +268,8 @@ class TrustRegion(eqx.Module):
         improve = (failed | level) & proposal.poor & ~self.improve & ~self.check
         faster = (lowest < (1 - _LITTLE) * before) | held | check.right
         came = self.settled | (level & (fun <= before))
-        revised = TrustRegion(
+        known = held & (error < _PREDICTED)
+        return TrustRegion(
             radius=radius,
             jacobian=proposal.jacobian,
             improve=improve,
@@ -285,11 +283,8 @@ class TrustRegion(eqx.Module):
             settled=check.right | settled(came, outcome, length, tested[best]),
             level=level,
             right=check.right,
-            foreseen=jnp.where(
-                held & (error < _PREDICTED), jnp.maximum(self.foreseen, length), self.foreseen
-            ),
+            foreseen=jnp.where(known, jnp.maximum(self.foreseen, length), self.foreseen),
         )
-        return revised
 
 
 def _is_lost(step: Array, center: Array, sigma: Array) -> Array:
