@@ -1,6 +1,7 @@
 """What every test runs under: strict dtypes and ranks, warnings as errors, x64 off by default."""
 
 import collections
+import concurrent.futures
 import gc
 import math
 import multiprocessing
@@ -187,3 +188,10 @@ def dtype(request):
 def key():
     """A typed key with a fixed seed."""
     return jax.random.key(0)
+
+
+@pytest.fixture
+def threads():
+    """Two threads to call a black box on."""
+    with concurrent.futures.ThreadPoolExecutor(2) as pool:
+        yield pool
