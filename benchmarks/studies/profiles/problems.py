@@ -22,6 +22,7 @@ from benchmarks.studies.profiles.kinds import CLEAN, RESIDUALS, SCALARS, Kind
 
 FIRST, LAST = "A", "L"  # letters that names begin with
 MOST_RESIDUALS = 500
+MOST = 20  # parameters
 STRIDE, SMALL = 10, 5  # quick: every tenth of those with up to five parameters
 WIDTH, BOX_WIDTH = 0.1, 2.0  # where to begin: as a share of the largest parameter; in BBOB's box
 BOX = 5.0  # of BBOB, to both sides
@@ -71,13 +72,19 @@ def residuals(full: bool) -> Iterator[Panel]:
 
 
 def scalars(full: bool) -> Iterator[Panel]:
-    """Numbers: up to 50 parameters; and sums of absolute residuals, which have kinks."""
+    """Numbers: up to 20 parameters; and sums of absolute residuals, which have kinks."""
     cases, budgets = _numbers(full), (10, 50, 200, 500) if full else (10, 30, 100)
     for kind in SCALARS:
         seen = [case._replace(kind=kind) for case in cases]
         yield Panel("scalars", f"Scalars, {kind.title}", seen, budgets)
     kinks = [_absolute(case) for case in _with_residuals(full)]
     yield Panel("scalars", "Scalars, sums of absolute values", kinks, budgets)
+
+
+def larger(full: bool) -> Iterator[Panel]:
+    """Numbers of 21 to 50 parameters, with smaller budgets, as a step of ours takes 15 ms."""
+    if full:
+        yield Panel("scalars50", "Scalars, clean, 50 parameters", _numbers(True, 21, 50), (10, 50))
 
 
 def bbob(n: int, full: bool) -> Iterator[Panel]:
@@ -128,7 +135,7 @@ def _with_residuals(full: bool) -> list[Case]:
         parts = lambda y: map(jnp.ravel, jax.tree.leaves(problem.constraint(y)))
         return lambda y: jnp.concatenate(list(parts(y)))
 
-    found = _named(_sif2jax().nonlinear_equations_problems, 20 if full else SMALL)
+    found = _named(_sif2jax().nonlinear_equations_problems, MOST if full else SMALL)
     funs = {name: (problem, residuals(problem)) for name, problem in found.items()}
     sizes = {name: jax.eval_shape(fun, problem.y0).size for name, (problem, fun) in funs.items()}
     # by shape: ours is compiled for each
@@ -140,14 +147,13 @@ def _with_residuals(full: bool) -> list[Case]:
 
 
 @cache
-def _numbers(full: bool) -> list[Case]:
+def _numbers(full: bool, least: int = 1, most: int = MOST) -> list[Case]:
     def value(problem: Any) -> Callable[[jax.Array], jax.Array]:
         return lambda y: problem.objective(y, problem.args)
 
-    found = _named(_sif2jax().unconstrained_minimisation_problems, 50 if full else SMALL)
-    chosen = sorted(found, key=lambda name: (np.size(found[name].y0), name))[
-        :: 1 if full else STRIDE
-    ]
+    found = _named(_sif2jax().unconstrained_minimisation_problems, most if full else SMALL)
+    sized = sorted((np.size(problem.y0), name) for name, problem in found.items())
+    chosen = [name for n, name in sized if n >= least][:: 1 if full else STRIDE]
     return _cases({name: (found[name], value(found[name])) for name in chosen})
 
 
@@ -185,7 +191,7 @@ def _sif2jax() -> ModuleType:
             del sys.modules[name]
 
 
-SETS = {"residuals": residuals, "scalars": scalars} | {
+SETS = {"residuals": residuals, "scalars": scalars, "scalars50": larger} | {
     f"bbob{n}": partial(bbob, n) for n in (5, 10, 20)
 }
 SETS["bbob160"] = partial(large, 160)
