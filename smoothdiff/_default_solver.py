@@ -28,8 +28,8 @@ from smoothdiff._support import MovingSupport, as_support
 _SHARE, _ALIKE = 0.2, 10.0
 # and of a range for residuals that are evaluated point by point: first points far apart tell most
 _WIDE = 0.4
-# but where a parameter starts within so much of the range from its end, the range is wide beside
-# what is known: sigma is smaller by the root of that share, at most so many times
+# ... times the root of how far from an end of the range a parameter starts, as a share of the first
+# number, but no less than the second: so near to it the range is wide beside what is known
 _EDGE, _LEAST = 0.1, 0.25
 # a step of Adam, in sigmas
 _RATE = 0.15
@@ -158,14 +158,16 @@ def _width(leaf: Array, share: ArrayLike, low: Any, high: Any) -> Array:
 
 
 def _wide(leaf: Array, low: Any, high: Any) -> np.ndarray | float:
-    """The share for residuals, less where the start is near an end."""
+    """The share for residuals: less where the start is near an end."""
     if low is None or high is None:
         return _WIDE
     y, low, high = (np.asarray(a, float) for a in (leaf, low, high))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        inside = np.minimum(y - low, high - y) / (high - low)
-    near = np.clip(np.sqrt(np.maximum(inside, 0) / _EDGE), _LEAST, 1)
-    return _WIDE * np.where(np.isfinite(inside), near, 1)
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        inside = np.where(np.isfinite(high - low), np.minimum(y - low, high - y) / (high - low), 1)
+    near = np.clip(np.sqrt(np.fmax(inside, 0) / _EDGE), _LEAST, 1)
+    if np.all(near == 1):
+        return _WIDE
+    return np.broadcast_to(_WIDE * near, leaf.shape).astype(leaf.dtype)
 
 
 def _sizes(leaf: np.ndarray) -> np.ndarray:

@@ -172,8 +172,8 @@ def least_squares(
             parameters on average. It may be an optimistix solver around one of ours.
         sigma: as for `minimise`. But with fewer than 100 parameters and without a support, the
             default is two fifths of a parameter's range: residuals of points far apart tell most.
-            From a start within a tenth of the range from its end it is less, by the root of the
-            distance, down to a quarter of that.
+            From a start within a tenth of the range from an end it is less, with the root of the
+            distance: at the end a tenth of the range.
         support: which residuals each parameter may move, as for `LocalGaussNewton`.
         target: as for `minimise`, a value of half the sum of squares.
         max_evaluations: as for `minimise`.

@@ -23,7 +23,7 @@ class Range(AbstractSpace):
         high: the largest value, itself included, likewise.
         log: on a logarithmic scale, for a parameter that may be small by any factor.
         sigma: the smoothing width as a share of the range. By default what the call takes of any
-            range: a fifth, `least_squares` often two fifths.
+            range: a fifth, `least_squares` often two fifths, and less from a start near an end.
         label: a name for plots, such as "width (mm)"; or one for each number of the parameter.
 
     Raises:

@@ -200,6 +200,22 @@ def test_residuals_from_near_an_end_of_a_range_begin_with_less_of_it(space):
     np.testing.assert_allclose(number.solver.sigma / scale, np.full(5, 0.2), rtol=1e-6)
 
 
+@pytest.mark.parametrize("size", [None, 2])
+def test_a_range_for_all_parameters_and_a_start_in_float32_where_float64_is_on(size, x64):
+    y0 = jnp.full(() if size is None else size, 0.1, jnp.float32)
+    residuals = lambda y, _: jnp.atleast_1d(y - jnp.asarray(3, y.dtype))
+    result = sd.least_squares(residuals, y0, key=KEY, bounds=(0.0, 10.0))
+    assert all(s.dtype == jnp.float32 for s in jax.tree.leaves(result.solver.sigma))
+    np.testing.assert_allclose(result.y, 3, rtol=1e-5)
+
+
+def test_what_has_one_end_or_a_range_beyond_all_measure_has_no_share_of_its_own(x64):
+    lows, highs = np.array([0.0, -1.5e308, -np.inf, 1.0]), np.array([np.inf, 1.5e308, 1.0, 1.0])
+    y0 = jnp.array([0.0, 1.0, 1.0, 1.0])
+    found = default_solver(y0, (lows, highs), None, residuals=True)
+    np.testing.assert_allclose(found.sigma, 0.2)
+
+
 @pytest.mark.slow
 def test_ten_starts_on_stairs_need_no_setting():
     found = [float(sd.minimise(stairs, jnp.zeros(3), key=jax.random.key(k)).fun) for k in range(5)]

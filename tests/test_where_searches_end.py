@@ -238,6 +238,16 @@ def test_a_fit_that_leaves_nothing_ends_at_once(dtype, x64):
     assert run(0, rtol=0.0)[0].evaluations == 60
 
 
+@pytest.mark.parametrize("follow", [{"target": 1e-2}, {"solver": sd.GaussNewton(2.0, restarts=20)}])
+@pytest.mark.parametrize("y0", [0.2, 2.0])
+def test_searches_that_may_follow_do_whatever_is_little(follow, y0):
+    """The loss is 24.5 in a minimum at 1 and zero at 8; usual are 1e13."""
+    fun = lambda y, _: jnp.stack([1e6 * (y - 1) * (y - 8), y - 8])
+    limits = {"bounds": (0.0, 10.0), "max_evaluations": 200}
+    result = sd.least_squares(fun, jnp.asarray(y0), key=KEY, **limits, **follow)
+    assert float(result.fun) < 1e-2
+
+
 def test_a_wrong_model_that_asks_for_a_tiny_step_has_not_converged():
     # the penalty beyond the jump makes the slope so steep that the step is lost in rounding
     fun = lambda y, args: jnp.where(y >= 1, y, 1e8)

@@ -1,4 +1,4 @@
-"""Signs that a search by points has converged: a short step, or a loss of which nothing is left."""
+"""Signs that a search by points has converged: short steps, and a loss of which little is left."""
 
 import math
 from typing import Any, NamedTuple
@@ -8,21 +8,24 @@ from jaxtyping import Array, Bool, Float
 
 from smoothdiff._params import Params
 from smoothdiff._solvers._base import promotion
-from smoothdiff._solvers._history import History
 from smoothdiff._solvers._point_search import AbstractPointSearch
 from smoothdiff._solvers._ratio_test import is_lower, taken_by_rounding
 
 # values that are the same at points further apart than so many roots of the rounding: a plateau
 _PLATEAU = 3
-# a loss is nothing if it is so small beside the highest of those that are known, but for a quarter
-# of them, which may be beyond all measure
-_MOST, _NOTHING = 0.75, {"float32": 1e-10, "float64": 1e-20}
+# next to nothing is left of a loss that is so small a share of the losses that are known, without
+# the highest quarter of them, which may be beyond all measure
+_MOST, _LEFT = 0.75, {"float32": 1e-10, "float64": 1e-20}
 
 
 class Signs(NamedTuple):
-    """Whether a step was `small`, of which several in a row tell, and whether no loss is less."""
+    """Whether a step was `small`, of which several in a row tell, or is the `last` of the search.
+
+    No loss is less than the `least`.
+    """
 
     small: Bool[Array, ""]
+    last: Bool[Array, ""]
     least: Bool[Array, ""]
 
 
@@ -63,18 +66,24 @@ def signs(
         small |= asked & after.right() & ~is_lower(fun, lowest_fun)
         small |= asked & after.level()
         apart = jnp.where(ignored, jnp.inf, _PLATEAU * rounding)
-        small &= after.settled() & ~after.plateau(apart)
-        small &= after.average is None
+        tells = after.settled() & ~after.plateau(apart)
+    no = jnp.asarray(False)
+    if after.average is not None:
+        return Signs(no, no, no)
     if not solver.squares:
-        return Signs(small, jnp.asarray(False))
+        return Signs(small & tells, no, no)
     # squares so small that all sums are zero say nothing
     known = ~(jnp.all(after.history.funs == 0) & jnp.any(rows != 0))
-    below = jnp.minimum(fun, lowest_fun)
-    least = (below == 0) | (short & ~search.teaches() & _is_nothing(below, after.history))
-    return Signs(small & known, least & known & (after.average is None))
+    last = no
+    # where searches follow, one that may be in a local minimum is not cut short
+    if not solver.restarts:
+        last = short & tells & ~search.teaches() & _little_is_left(after)
+    return Signs(small & tells & known, last & known, (jnp.minimum(fun, lowest_fun) == 0) & known)
 
 
-def _is_nothing(fun: Float[Array, ""], history: History) -> Bool[Array, ""]:
-    """Whether a loss is nothing beside others, so that a short step needs no check."""
+def _little_is_left(search: AbstractPointSearch) -> Bool[Array, ""]:
+    """Whether next to nothing is left of the loss, so that a short step needs no check."""
+    history = search.history
     known = jnp.where(history.valid, history.funs, jnp.nan)
-    return fun <= _NOTHING[fun.dtype.name] * jnp.nanquantile(known, _MOST)
+    usual = jnp.nanquantile(known, _MOST, method="lower")
+    return history.best(search.start)[2] <= _LEFT[usual.dtype.name] * usual

@@ -149,13 +149,12 @@ class PointStep(eqx.Module):
         theta, width = after.iterate(), after.width()
         new_y = params.layout.tree(theta)
         point, fun = lowest(points, jnp.where(good, funs, jnp.inf))
-        small, least = signs(
-            solver, params, search, after, (points, rows, fun), progress.lowest_fun
-        )
+        new = points, rows, fun
+        small, last, least = signs(solver, params, search, after, new, progress.lowest_fun)
         # where a model is wrong, its steps may be short for that: a check comes after the first
         looking = search.is_looking()
         checks = small & (search.small == 0) & ~after.right() & ~looking
-        after = after.counted(small | looking, search.teaches(), least, sizes.step)
+        after = after.counted(small | looking, search.teaches(), least | last, sizes.step)
         after = where(checks, after.checked(), after).looking(params, sizes, least)
         # the end of a step that is tried may be anything, and so may a place that nobody asked for
         later = state.restarts < solver.restarts

@@ -171,13 +171,13 @@ class AbstractPointSearch(eqx.Module):
         """Whether the next evaluation is no step, and counts as none."""
         return self.checking() | self.is_looking()
 
-    def counted(self, small: Array, teaches: Array, least: Array, count: int) -> Any:
-        """With a small step more or less, and so many evaluations; `least` is as low as can be.
+    def counted(self, small: Array, teaches: Array, last: Array, count: int) -> Any:
+        """With a small step more or less, and so many evaluations; the `last` one is enough.
 
         What only `teaches` is no step.
         """
         small = jnp.where(small, jnp.where(teaches, self.small, self.small + 1), 0)
-        small = jnp.where(least, _SMALL, small)
+        small = jnp.where(last, _SMALL, small)
         counts = self.evaluated + count, small
         counted = eqx.tree_at(lambda s: (s.evaluated, s.small), self, counts)
         return counted.marked(count)

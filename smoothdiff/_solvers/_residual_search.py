@@ -103,11 +103,11 @@ class ResidualSearch(AbstractLookingSearch):
         """Whether it converged, or so many evaluations in a row were hardly lower."""
         return self.converged() | (self.stale >= sizes.patience)
 
-    def counted(self, small: Array, teaches: Array, least: Array, count: int) -> "ResidualSearch":
+    def counted(self, small: Array, teaches: Array, last: Array, count: int) -> "ResidualSearch":
         """Before the minimum of a ripple is taken for the answer, wide rounds look around once."""
-        after = super().counted(small, teaches, least, count)
+        after = super().counted(small, teaches, last, count)
         unseen = (self.wide.rounds == 0) & self.is_local() & self.trust.of_ripple()
-        doubt = after.converged() & unseen & self._much() & ~least
+        doubt = after.converged() & unseen & self._much()
         around = after._to_wide(jnp.ones_like(self.wide.scale))
         around = eqx.tree_at(lambda s: s.small, around, jnp.zeros_like(self.small))
         return where(doubt, around, after)

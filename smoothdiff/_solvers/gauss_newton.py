@@ -115,9 +115,9 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             for nothing: one evaluation where the model is least sure, so far away that the loss
             should rise by a share of 4e-4. Where no step as long as a hundredth of sigma
             was predicted, and more than a tenth of the first loss is left, that may be a ripple's
-            minimum: wide rounds look around first. One short step is enough where no more than
-            1e-20 is left of the losses that are known, without the highest quarter of them; in
-            float32 1e-10.
+            minimum: wide rounds look around first. Without `restarts` one short step is enough
+            where 1e-20 or less is left of the losses that are known, without the highest quarter
+            of them; in float32 1e-10.
         atol: absolute tolerance. With both zero no run converges; else the tolerance is at least
             the root of the rounding of max(|y|, sigma). With batches steps and tolerances are
             compared by their norms, without sigma.
