@@ -77,7 +77,9 @@ def signs(
     last = no
     # where searches follow, one that may be in a local minimum is not cut short
     if not solver.restarts:
-        last = short & tells & ~search.teaches() & _little_is_left(after)
+        # nor one of a model that has not shown yet that it is right
+        step = search.is_local() & ~search.checking() & search.settled()
+        last = step & short & tells & _little_is_left(after)
     return Signs(small & tells & known, last & known, (jnp.minimum(fun, lowest_fun) == 0) & known)
 
 
