@@ -20,7 +20,7 @@ import numpy as np
 from benchmarks.methods._flat import package
 from benchmarks.studies.profiles.kinds import CLEAN, RESIDUALS, SCALARS, Kind
 
-FIRST, LAST = "A", "L"  # letters that names begin with
+LETTERS, OTHERS = ("A", "L"), ("M", "Z")  # that names begin with: to develop on, to check
 MOST_RESIDUALS = 500
 MOST = 20  # parameters
 STRIDE, SMALL = 10, 5  # quick: every tenth of those with up to five parameters
@@ -79,6 +79,13 @@ def scalars(full: bool) -> Iterator[Panel]:
         yield Panel("scalars", f"Scalars, {kind.title}", seen, budgets)
     kinks = [_absolute(case) for case in _with_residuals(full)]
     yield Panel("scalars", "Scalars, sums of absolute values", kinks, budgets)
+
+
+def held_out(full: bool) -> Iterator[Panel]:
+    """Numbers with other names, which nothing was chosen on."""
+    for kind in (CLEAN, *RESIDUALS[1::2]):
+        seen = [case._replace(kind=kind) for case in _numbers(full, letters=OTHERS)]
+        yield Panel("held_out", f"Scalars from M to Z, {kind.title}", seen, (10, 50))
 
 
 def larger(full: bool) -> Iterator[Panel]:
@@ -147,23 +154,27 @@ def _with_residuals(full: bool) -> list[Case]:
 
 
 @cache
-def _numbers(full: bool, least: int = 1, most: int = MOST) -> list[Case]:
+def _numbers(
+    full: bool, least: int = 1, most: int = MOST, letters: tuple[str, str] = LETTERS
+) -> list[Case]:
     def value(problem: Any) -> Callable[[jax.Array], jax.Array]:
         return lambda y: problem.objective(y, problem.args)
 
-    found = _named(_sif2jax().unconstrained_minimisation_problems, most if full else SMALL)
+    problems = _sif2jax().unconstrained_minimisation_problems
+    found = _named(problems, most if full else SMALL, letters)
     sized = sorted((np.size(problem.y0), name) for name, problem in found.items())
     chosen = [name for n, name in sized if n >= least][:: 1 if full else STRIDE]
     return _cases({name: (found[name], value(found[name])) for name in chosen})
 
 
-def _named(problems: Any, most: int) -> dict[str, Any]:
+def _named(problems: Any, most: int, letters: tuple[str, str] = LETTERS) -> dict[str, Any]:
     """Those with such a name, and one array of so many parameters at most."""
+    first, last = letters
     named = {type(problem).__name__: problem for problem in problems}
     shapes = {
         name: jax.eval_shape(lambda problem=problem: problem.y0)  # some have millions
         for name, problem in named.items()
-        if FIRST <= name[0] <= LAST
+        if first <= name[0] <= last
     }
     single = {name: shape for name, shape in shapes.items() if hasattr(shape, "size")}
     return {name: named[name] for name, shape in single.items() if shape.size <= most}
@@ -191,7 +202,10 @@ def _sif2jax() -> ModuleType:
             del sys.modules[name]
 
 
-SETS = {"residuals": residuals, "scalars": scalars, "scalars50": larger} | {
-    f"bbob{n}": partial(bbob, n) for n in (5, 10, 20)
-}
+SETS = {
+    "residuals": residuals,
+    "scalars": scalars,
+    "scalars50": larger,
+    "held_out": held_out,
+} | {f"bbob{n}": partial(bbob, n) for n in (5, 10, 20)}
 SETS["bbob160"] = partial(large, 160)
