@@ -184,7 +184,7 @@ def test_residuals_from_near_an_end_of_a_range_begin_with_less_of_it(space):
     """
     low, high = jnp.zeros(5), jnp.full(5, 10.0)
     y0 = jnp.array([5.0, 1.0, 9.75, 0.01, 0.0])
-    where = {"space": sd.Range(low, high)} if space else {"bounds": (low, high)}
+    where: dict[str, Any] = {"space": sd.Range(low, high)} if space else {"bounds": (low, high)}
     call = lambda **more: (
         sd.least_squares(lambda y, _: y, y0, key=KEY, max_steps=1, **(where | more)).solver.sigma
     )
