@@ -28,8 +28,8 @@ from smoothdiff._support import MovingSupport, as_support
 _SHARE, _ALIKE = 0.2, 10.0
 # and of a range for residuals that are evaluated point by point: first points far apart tell most
 _WIDE = 0.4
-# ... times the root of how far from an end of the range a parameter starts, as a share of the first
-# number, but no less than the second: so near to it the range is wide beside what is known
+# a start within the first share of a range from its end says that the range is wide beside what is
+# known: there sigma falls with the root of the distance, to the second share of the usual one
 _EDGE, _LEAST = 0.1, 0.25
 # a step of Adam, in sigmas
 _RATE = 0.15
@@ -45,7 +45,17 @@ def share_of_range(
     residuals: bool,
     support: Callable[[PyTree], Array] | None = None,
 ) -> PyTree:
-    """The default sigma of each parameter as a share of its range."""
+    """The default sigma of each parameter as a share of its range.
+
+    Args:
+        y: where to start, in the coordinates of the bounds.
+        bounds: the pair (low, high), None where there are none.
+        residuals: whether residuals are minimised, rather than a number.
+        support: which residuals each parameter may move, if that is known.
+
+    Returns:
+        For each leaf a number, or an array of its shape and dtype.
+    """
     leaves, treedef = jax.tree.flatten(y)
     if not residuals or support is not None or GaussNewton(1.0).sizes(y) is None:
         return treedef.unflatten([SIGMA] * len(leaves))

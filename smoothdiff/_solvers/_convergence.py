@@ -1,4 +1,8 @@
-"""Signs that a search by points has converged: short steps, and a loss of which little is left."""
+"""Signs that a search by points has converged: short steps, and a loss of which little is left.
+
+Source: own; that a loss of 1e-20 of the first one is enough is the rule of DFO-LS (Cartis, Fiala,
+Marteau and Roberts, 2019), which needs no short step.
+"""
 
 import math
 from typing import Any, NamedTuple
@@ -47,6 +51,9 @@ def signs(
         new: the points, of which the first is the model's step, what the function returned there,
             and the lowest value.
         lowest_fun: the lowest before.
+
+    Returns:
+        What holds after the step.
     """
     points, rows, fun = new
     asked = (solver.rtol > 0) | (solver.atol > 0)
