@@ -45,6 +45,7 @@ OTHERS = {
     "dfo_ls": Named("DFO-LS", "#0F9BB8"),
     "dfo_ls_noise": Named("DFO-LS, told of noise", "#0F9BB8", DASHED),
     "least_squares": Named("SciPy least_squares", "#7089A8", DASHED),
+    "random_search": Named("Random search", "#7A8896"),
     "nelder_mead": Named("Nelder-Mead", "#008F6B"),
     "finite_differences": Named("Differences, Adam", "#7A9A2E"),
     "grey_differences": Named("Differences, network", "#7A9A2E"),

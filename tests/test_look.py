@@ -1,5 +1,7 @@
 """Within bounds a search looks elsewhere once: what is found there, and what it costs."""
 
+from itertools import product
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -68,12 +70,31 @@ def test_a_minimum_with_a_kink_is_left(seed):
     np.testing.assert_allclose(left.y, BASIN, atol=1e-3)
 
 
+@pytest.mark.parametrize("seed", quick_of(range(3), [1]))
+def test_where_the_function_hardly_falls_the_look_comes_at_once(seed):
+    """A valley that gains little for long, beside a lower basin: nobody goes to its end first."""
+
+    def fun(y, args=None):
+        valley = 1 + jnp.abs(y[1] - 0.9) + 1e-3 * (y[0] - y[1]) ** 2
+        return jnp.where(y[1] > 0.8, valley, jnp.sum((y - BASIN) ** 2))
+
+    points = []
+    solver, key = sd.NewtonCG(0.05), jax.random.key(seed)
+    call = watched(fun, points)
+    start = jnp.array([0.1, 0.95])
+    found = sd.minimise(call, start, solver=solver, key=key, bounds=(LOW, HIGH))
+    np.testing.assert_allclose(found.y, BASIN, atol=1e-3)
+    there = np.linalg.norm(np.array(points) - np.asarray(BASIN), axis=1) < 0.1
+    assert np.argmax(there) < 40
+
+
 @pytest.mark.slow
 def test_a_look_that_finds_nothing_breaks_into_no_round():
     """Several points of a round are asked for at once: after the look none comes again."""
-    stairs = lambda y: np.sum(np.floor(30 * np.abs(y - 0.3)))
+    fine = lambda y: np.sum(np.floor(300 * np.abs(y - 0.3)))
+    valley = lambda y: np.floor(50 * (100 * (y[1] - y[0] ** 2) ** 2 + (1 - y[0]) ** 2))
     both = 0
-    for seed in range(6):
+    for stairs, seed in product((fine, valley), range(4)):
         start = np.random.default_rng(seed).random(2)
         search = sd.Search(start, key=jax.random.key(seed), bounds=(LOW, HIGH))
         rounds, stages = [], []

@@ -17,9 +17,8 @@ from smoothdiff._solvers._ratio_test import is_lower, taken_by_rounding
 
 # values that are the same at points further apart than so many roots of the rounding: a plateau
 _PLATEAU = 3
-# next to nothing is left of a loss that is so small a share of the losses that are known, without
-# the highest quarter of them, which may be beyond all measure
-_MOST, _LEFT = 0.75, {"float32": 1e-10, "float64": 1e-20}
+# next to nothing is left of a loss that is so small a share of the usual one
+_LEFT = {"float32": 1e-10, "float64": 1e-20}
 
 
 class Signs(NamedTuple):
@@ -93,6 +92,5 @@ def signs(
 def _little_is_left(search: AbstractPointSearch) -> Bool[Array, ""]:
     """Whether next to nothing is left of the loss, so that a short step needs no check."""
     history = search.history
-    known = jnp.where(history.valid, history.funs, jnp.nan)
-    usual = jnp.nanquantile(known, _MOST, method="lower")
+    usual = history.usual()
     return history.best(search.start)[2] <= _LEFT[usual.dtype.name] * usual

@@ -12,6 +12,8 @@ from smoothdiff._products import dot
 _LOWER = 0.8
 # numbers that differ by so many roundings are hardly told apart
 _HARDLY = 64
+# the highest values may be beyond all measure: of those below, this quantile is a usual one
+_USUAL = 0.75
 
 
 def alike(rows: Float[Array, "M P"], row: Float[Array, " P"]) -> Bool[Array, " M"]:
@@ -98,6 +100,16 @@ class History(eqx.Module):
     def went_lower(self, other: "History") -> Bool[Array, ""]:
         """Whether the lowest value is lower than that of another history."""
         return jnp.min(self._known()) < jnp.min(other._known())
+
+    def usual(self) -> Float[Array, ""]:
+        """A value as most places have it, without the highest quarter."""
+        return jnp.nanquantile(jnp.where(self.valid, self.funs, jnp.nan), _USUAL, method="lower")
+
+    def fell(self, count: int) -> Float[Array, ""]:
+        """By how much the last evaluations lowered the function: so many, of longer ones most."""
+        known = self._known()
+        count = min(count, 3 * len(known) // 4)
+        return jnp.min(known[:-count]) - jnp.min(known)
 
     def _known(self) -> Float[Array, " M"]:
         return jnp.where(self.valid, self.funs, jnp.inf)

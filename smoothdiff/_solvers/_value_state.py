@@ -32,6 +32,9 @@ _NEAREST = 1e-5
 _PATIENCES = 2
 # a parameter whose start is near its lowest point by chance brings others no nearer than this
 _LEAST_NEAR = 0.25
+# the function hardly falls where so many evaluations, for each parameter and one, lower it by no
+# more than this share of its value, and of what it fell
+_HARDLY, _LITTLE = 4, 0.01
 # the widths of later searches, in sigma, as powers of ten at random
 _NARROWEST, _WIDEST = -1.5, 0.3
 
@@ -217,13 +220,18 @@ class ValueState(AbstractLookingSearch):
         return self.converged() & look.is_far(params, self.history.best(self.start)[0])
 
     def look_due(self, params: Params, sizes: Sizes) -> Bool[Array, ""]:
-        """Also between rounds, once the local model has failed: wide samples alone take long.
+        """Also where the function hardly falls: to end the search may take long, and gain little.
 
-        Where the function has noise they go on. Before the first round nobody knows if it has.
+        And between rounds, once the local model has failed: wide samples alone take long. Where the
+        function has noise both go on. Before the first round nobody knows if it has.
         """
         between = (self.stage == WIDE) & (self.rounds > 0) & (self.taken == 0)
-        alone = has_box(params) & between & self.trust.failed() & ~self.noisy
-        return super().look_due(params, sizes) | alone
+        history, (_, _, fun) = self.history, self.history.best(self.start)
+        # beside a height of no meaning all further falls are little, but not beside the value
+        whole = jnp.minimum(history.usual() - fun, jnp.abs(fun))
+        hardly = history.fell(_HARDLY * (len(self.start) + 1)) <= _LITTLE * whole
+        early = (between & self.trust.failed()) | ((self.is_local() | between) & hardly)
+        return super().look_due(params, sizes) | (early & has_box(params) & ~self.noisy)
 
     def lost(self, sizes: Sizes) -> Bool[Array, ""]:
         """Whether neither model leads anywhere; after one converged the wide one may yet."""

@@ -70,9 +70,10 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     the wide model alone.
 
     Within finite bounds a search looks once at n + 1 points spread over all of the box, and at n
-    that differ from the best one in one parameter each: before it ends, or once its local model has
-    failed and a round has shown no noise. Where one is lower, it begins anew, and may look again.
-    Else it goes on. A value that is not finite ends nothing there. With `restarts` all 2n + 1 are
+    that differ from the best one in one parameter each: once 4 (n + 1) evaluations have lowered the
+    function by less than 0.01 of what it fell in those that are kept, or between rounds if its
+    local model has failed, as long as no round has shown noise; else before it ends. Where one is
+    lower, it begins anew, and may look again. Else it goes on. A value that is not finite ends nothing there. With `restarts` all 2n + 1 are
     anywhere, and searches that are added do not look. Where there is no box and it has converged
     more than 1e5 sigma from the start, it begins anew there once, half as wide as it came far, and
     looks at one point twice as far away each time: a function that falls for ever has no minimum.

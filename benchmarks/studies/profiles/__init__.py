@@ -2,9 +2,9 @@
 
 Methods see residuals or numbers, exact, with noise, or rounded; the exact values are scored. A
 budget counts in units of n + 1 evaluations, for BBOB of n. `python -m benchmarks profiles bbob5`
-runs one of the sets: residuals, scalars, scalars50, held_out with other names, and by the number of
-parameters bbob5, bbob10, bbob20 and, of COCO's large-scale suite, bbob160. With `--jobs 16` sixteen
-processes share the runs.
+runs one of the sets: residuals, scalars, scalars50, held_out with other names, settings of models
+of scikit-learn, and by the number of parameters bbob5, bbob10, bbob20 and, of COCO's large-scale
+suite, bbob160. With `--jobs 16` sixteen processes share the runs.
 """
 
 from argparse import Namespace

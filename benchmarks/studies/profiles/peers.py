@@ -77,6 +77,16 @@ def bipop_cma_es(seen: Seen) -> None:
     cma.fmin2(seen, start, case.width, options, restarts=9, bipop=True)
 
 
+def random_search(seen: Seen) -> None:
+    """Anywhere in the box; without one around the start, so far away as the first width says."""
+    case = seen.case
+    random = np.random.default_rng(list(case.name.encode()))  # other starts have other points
+    seen(case.start)
+    while True:
+        away = case.width * random.normal(size=case.start.size)
+        seen(case.start + away if case.bounds is None else random.uniform(*case.bounds))
+
+
 def _scipy(seen: Seen, method: str, **how: Any) -> None:
     optimize.minimize(seen, seen.case.start, method=method, **how)
 
@@ -99,4 +109,5 @@ METHODS = {
     "bfgs": _method("BFGS (SciPy)", bfgs),
     "nelder_mead": _method("Nelder-Mead (SciPy)", nelder_mead),
     "bipop_cma_es": _method("BIPOP-CMA-ES (pycma)", bipop_cma_es),
+    "random_search": _method("random search", random_search),
 }

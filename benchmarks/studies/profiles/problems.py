@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.methods._flat import package
+from benchmarks.studies.profiles import models
 from benchmarks.studies.profiles.kinds import CLEAN, RESIDUALS, SCALARS, Kind
 
 LETTERS, OTHERS = ("A", "L"), ("M", "Z")  # that names begin with: to develop on, to check
@@ -120,6 +121,27 @@ def large(n: int, full: bool) -> Iterator[Panel]:
     yield Panel(f"bbob{n}", f"BBOB, {n}-D", cases, (10, 30), more=0, targets=TARGETS)
 
 
+def settings(full: bool) -> Iterator[Panel]:
+    """Of models: those that something was chosen on, and others. The quick setting has two."""
+    found, starts = models.models(), models.STARTS if full else 1
+    chosen = (
+        (models.CHOSEN_ON, models.OTHERS) if full else (models.CHOSEN_ON[-1:], models.OTHERS[-1:])
+    )
+    for title, names in zip(
+        ("Settings of models", "Settings of other models"), chosen, strict=True
+    ):
+        cases = [
+            _setting(f"{name}-{number}", models.error(found[name]), start)
+            for name in names
+            for number, start in enumerate(models.starts(found[name], starts))
+        ]
+        yield Panel("settings", title, cases, (5, 10, 20, 30) if full else (5, 10))
+
+
+def _setting(name: str, fun: Callable[[np.ndarray], float], start: np.ndarray) -> Case:
+    return Case(name, fun, start, models.WIDTH, (np.zeros_like(start), np.ones_like(start)))
+
+
 def _bbob(cocoex: ModuleType, number: int, n: int, instance: int) -> Case:
     problem = cocoex.BareProblem("bbob", number, n, instance)
     return _case(problem, problem.best_value(), number, n, instance)
@@ -207,5 +229,6 @@ SETS = {
     "scalars": scalars,
     "scalars50": larger,
     "held_out": held_out,
+    "settings": settings,
 } | {f"bbob{n}": partial(bbob, n) for n in (5, 10, 20)}
 SETS["bbob160"] = partial(large, 160)
