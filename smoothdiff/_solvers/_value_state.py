@@ -230,6 +230,8 @@ class ValueState(AbstractLookingSearch):
         # beside a height of no meaning all further falls are little, but not beside the value
         whole = jnp.minimum(history.usual() - fun, jnp.abs(fun))
         hardly = history.fell(_HARDLY * (len(self.start) + 1)) <= _LITTLE * whole
+        # a model that predicts may be on its way through a long valley
+        hardly &= ~self.trust.predicts()
         early = (between & self.trust.failed()) | ((self.is_local() | between) & hardly)
         return super().look_due(params, sizes) | (early & has_box(params) & ~self.noisy)
 

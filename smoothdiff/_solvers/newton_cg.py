@@ -71,9 +71,10 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
 
     Within finite bounds a search looks once at n + 1 points spread over all of the box, and at n
     that differ from the best one in one parameter each: once 4 (n + 1) evaluations have lowered the
-    function by less than 0.01 of what it fell in those that are kept, or between rounds if its
-    local model has failed, as long as no round has shown noise; else before it ends. Where one is
-    lower, it begins anew, and may look again. Else it goes on. A value that is not finite ends nothing there. With `restarts` all 2n + 1 are
+    function by less than 0.01 of its value and of what it fell, and half of the local model's steps
+    have failed of late; or between rounds if that model has failed for good; where a round has
+    shown noise, before it ends. Where one is lower, it begins anew, and may look again. Else it
+    goes on. A value that is not finite ends nothing there. With `restarts` all 2n + 1 are
     anywhere, and searches that are added do not look. Where there is no box and it has converged
     more than 1e5 sigma from the start, it begins anew there once, half as wide as it came far, and
     looks at one point twice as far away each time: a function that falls for ever has no minimum.
