@@ -14,7 +14,7 @@ from benchmarks import _study
 from benchmarks._grid import Grid, Row, to_rich
 from benchmarks._task import NotAble, precision
 from benchmarks.studies import profiles
-from benchmarks.studies.profiles import kept, kinds, ours, peers
+from benchmarks.studies.profiles import kept, kinds, models, ours, peers
 from benchmarks.studies.profiles.problems import Case, Panel
 from benchmarks.studies.profiles.runs import Method, Seen, Spent, trace
 from benchmarks.studies.profiles.shares import PAIRS, profile
@@ -189,7 +189,7 @@ def test_processes_that_share_the_runs_make_each_once(tmp_path, monkeypatch):
     assert len(calls) == 6
 
 
-@pytest.mark.parametrize("name", list(peers.METHODS))
+@pytest.mark.parametrize("name", [name for name in peers.METHODS if name != "random_search"])
 def test_peers_solve_a_toy_within_their_budget(name):
     method, modules = peers.METHODS[name], {"dfo_ls": "dfols", "py_bobyqa": "pybobyqa"}
     for start, module in modules.items():
@@ -236,3 +236,29 @@ def test_no_number_of_a_table_is_cut_in_a_narrow_terminal():
     # what is folded goes on in the next line
     digits = [c for c in printed.getvalue() if c.isdigit()]
     assert sorted(digits) == sorted("846654978869999388")
+
+
+def test_settings_of_models_are_functions_that_jump():
+    found = models.models()
+    assert set(found) == {*models.CHOSEN_ON, *models.OTHERS}
+    for model in found.values():
+        fun, (start, other) = models.error(model), models.starts(model, 2)
+        assert np.all((start > 0) & (start < 1) & (start != other))
+        assert np.isfinite(fun(start))
+    # a number of trees is rounded
+    fun, n = models.error(found["trees"]), len(found["trees"].settings)
+    apart = np.eye(n)[0] / 38  # of the range, one tree
+    assert fun(np.full(n, 0.5)) == fun(np.full(n, 0.5) + 0.4 * apart)
+    assert fun(np.full(n, 0.5)) != fun(np.full(n, 0.5) + 2 * apart)
+
+
+def test_random_search_begins_elsewhere_for_other_starts():
+    points = []
+    for name in "ab":
+        case = bowl(name=name)._replace(bounds=(np.zeros(2), np.ones(2)))
+        seen = []
+        fun = lambda x, seen=seen: (seen.append(x), np.sum(x**2))[1]
+        trace(peers.METHODS["random_search"], case._replace(fun=fun), 5)
+        points.append(np.array(seen[2:]))  # the start is scored, then evaluated
+    assert np.all((points[0] >= 0) & (points[0] <= 1))
+    assert len(np.unique(np.concatenate(points), axis=0)) == 8

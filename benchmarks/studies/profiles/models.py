@@ -1,9 +1,11 @@
-"""Settings of scikit-learn's models: the error in threefold cross-validation, over a unit cube.
+"""Settings of scikit-learn's models: minus the score of cross-validation, over a unit cube.
 
 A function here is what a user has who seeks the settings of a model: it jumps where a number is
 rounded or a choice changes, is level where nothing does, and may have several valleys.
 """
 
+import contextlib
+import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
 from types import SimpleNamespace
@@ -130,16 +132,18 @@ def models() -> dict[str, Model]:
 
 
 def error(model: Model) -> Callable[[np.ndarray], float]:
-    """The error of a model as a function of its settings, each as a share of its range."""
+    """Minus the score of a model, threefold, as a function of the shares of its ranges."""
     sk = _scikit_learn()
     inputs, targets = _data(sk, model.data, model.rows)
-    spaces = model.settings.items()
+    spaces, score = model.settings.items(), sk.model_selection.cross_val_score
 
     def fun(shares: np.ndarray) -> float:
         at = {name: float(of.to_natural(u)) for (name, of), u in zip(spaces, shares, strict=True)}
-        built = model.build(**at)
-        score = sk.model_selection.cross_val_score
-        return -float(np.mean(score(built, inputs, targets, cv=3, scoring=model.scored)))
+        how: Any = {"cv": 3, "scoring": model.scored}
+        # some settings overflow, in others a fit is cut short
+        with warnings.catch_warnings(action="ignore"), contextlib.suppress(ValueError):
+            return -float(np.mean(score(model.build(**at), inputs, targets, **how)))
+        return np.nan
 
     return fun
 
