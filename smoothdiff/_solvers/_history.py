@@ -102,14 +102,8 @@ class History(eqx.Module):
         return jnp.min(self._known()) < jnp.min(other._known())
 
     def usual(self) -> Float[Array, ""]:
-        """A value as most places have it, without the highest quarter."""
+        """A value as most places have it: the highest of three quarters."""
         return jnp.nanquantile(jnp.where(self.valid, self.funs, jnp.nan), _USUAL, method="lower")
-
-    def fell(self, count: int) -> Float[Array, ""]:
-        """By how much the last evaluations lowered the function: so many, of longer ones most."""
-        known = self._known()
-        count = min(count, 3 * len(known) // 4)
-        return jnp.min(known[:-count]) - jnp.min(known)
 
     def _known(self) -> Float[Array, " M"]:
         return jnp.where(self.valid, self.funs, jnp.inf)

@@ -20,7 +20,7 @@ from smoothdiff._solvers._where import where
 class AbstractLookingSearch(AbstractPointSearch):
     """A search that begins anew where points that no model asked for are lower.
 
-    A `pilot` follows first points that hardly differ, a `look` comes where a search would end.
+    A `pilot` follows first points that hardly differ, a `look` comes where little is left to do.
     """
 
     @abc.abstractmethod

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 from smoothdiff._params import Params
 from smoothdiff._solvers._base import all_finite
 from smoothdiff._solvers._box import bounds_of
+from smoothdiff._solvers._fall import Fall
 from smoothdiff._solvers._first_points import CARRIED, NEARER, FirstPoints, others_nearer
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import differ
@@ -93,6 +94,11 @@ class ValueSearch(ValueState):
         known = self.kept(new)
         known = eqx.tree_at(lambda s: s.turn, known, self.turn.more(sizes.step))
 
+        def fall() -> Fall:
+            history = known.history
+            fun = jnp.where(jnp.any(history.valid), history.best(self.start)[2], jnp.inf)
+            return self.fall.after(fun, history.usual(), sizes.step)
+
         def first() -> "ValueSearch":
             first = self.first.known(sizes.step)
             enough, told = first.done(), first.told()
@@ -111,13 +117,15 @@ class ValueSearch(ValueState):
             trust = self.trust.revise(proposal, before, new.funs, new.valid)
             slow = jnp.where(known.at_bottom(sizes, self.trust.radius), _ENOUGH, trust.slow)
             trust = eqx.tree_at(lambda t: t.slow, trust, slow)
-            changed = trust, known.history.best(self.start)[0]
-            return eqx.tree_at(lambda s: (s.trust, s.place), known, changed)._turned(params, sizes)
+            changed = trust, known.history.best(self.start)[0], fall()
+            after = eqx.tree_at(lambda s: (s.trust, s.place, s.fall), known, changed)
+            return after._turned(params, sizes)
 
         def wide() -> "ValueSearch":
             taken = self.taken + sizes.step
             noisy = self.noisy | (self.checks_noise() & new.valid[0] & differ(new.funs[0], before))
-            more = eqx.tree_at(lambda s: (s.taken, s.noisy), known, (taken, noisy))
+            changed = taken, noisy, fall()
+            more = eqx.tree_at(lambda s: (s.taken, s.noisy, s.fall), known, changed)
             full = lambda: more._stepped(params, sizes)._turned(params, sizes)
             return jax.lax.cond(taken >= sizes.first, full, lambda: more)
 

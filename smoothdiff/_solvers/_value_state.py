@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
 from smoothdiff._solvers._box import has_box
+from smoothdiff._solvers._fall import Fall
 from smoothdiff._solvers._first_points import FARTHER, NEARER, FirstPoints
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._looking_search import AbstractLookingSearch
@@ -32,9 +33,6 @@ _NEAREST = 1e-5
 _PATIENCES = 2
 # a parameter whose start is near its lowest point by chance brings others no nearer than this
 _LEAST_NEAR = 0.25
-# the function hardly falls where so many evaluations, for each parameter and one, lower it by no
-# more than this share of its value, and of what it fell
-_HARDLY, _LITTLE = 4, 0.01
 # the widths of later searches, in sigma, as powers of ten at random
 _NARROWEST, _WIDEST = -1.5, 0.3
 
@@ -50,7 +48,7 @@ class ValueState(AbstractLookingSearch):
     is low. Nor does any search where the function is `noisy`: where it gave another value for the
     same point, which the first round of samples begins with. Parameters are `unchanging` whose
     first points had the value of the start. First points that are left are `near` times as far as
-    sigma says.
+    sigma says. `fall` is of the steps and rounds of this search.
     """
 
     scan: Scan | None
@@ -58,6 +56,7 @@ class ValueState(AbstractLookingSearch):
     noisy: Bool[Array, ""]
     unchanging: Bool[Array, " n"]
     near: Float[Array, ""]
+    fall: Fall
     trust: QuadraticTrust
     place: Float[Array, " n"]
     center: Center
@@ -100,6 +99,7 @@ class ValueState(AbstractLookingSearch):
             noisy=jnp.asarray(False),
             unchanging=jnp.zeros(n, bool),
             near=jnp.ones_like(never),
+            fall=Fall.start(never),
             trust=QuadraticTrust.start(sigma, width),
             place=theta,
             center=center,
@@ -222,17 +222,14 @@ class ValueState(AbstractLookingSearch):
     def look_due(self, params: Params, sizes: Sizes) -> Bool[Array, ""]:
         """Also where the function hardly falls: to end the search may take long, and gain little.
 
-        And between rounds, once the local model has failed: wide samples alone take long. Where the
-        function has noise both go on. Before the first round nobody knows if it has.
+        And between rounds, once the local model has failed: wide samples alone take long. Where a
+        round has shown noise both go on.
         """
         between = (self.stage == WIDE) & (self.rounds > 0) & (self.taken == 0)
-        history, (_, _, fun) = self.history, self.history.best(self.start)
-        # beside a height of no meaning all further falls are little, but not beside the value
-        whole = jnp.minimum(history.usual() - fun, jnp.abs(fun))
-        hardly = history.fell(_HARDLY * (len(self.start) + 1)) <= _LITTLE * whole
+        hardly = self.fall.long_ago(len(self.start), sizes.step)
         # a model that predicts may be on its way through a long valley
-        hardly &= ~self.trust.predicts()
-        early = (between & self.trust.failed()) | ((self.is_local() | between) & hardly)
+        hardly &= (self.is_local() | between) & ~self.trust.predicts()
+        early = hardly | (between & self.trust.failed())
         return super().look_due(params, sizes) | (early & has_box(params) & ~self.noisy)
 
     def lost(self, sizes: Sizes) -> Bool[Array, ""]:

@@ -4,7 +4,6 @@ A function here is what a user has who seeks the settings of a model: it jumps w
 rounded or a choice changes, is level where nothing does, and may have several valleys.
 """
 
-import contextlib
 import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -141,9 +140,13 @@ def error(model: Model) -> Callable[[np.ndarray], float]:
         at = {name: float(of.to_natural(u)) for (name, of), u in zip(spaces, shares, strict=True)}
         how: Any = {"cv": 3, "scoring": model.scored}
         # some settings overflow, in others a fit is cut short
-        with warnings.catch_warnings(action="ignore"), contextlib.suppress(ValueError):
-            return -float(np.mean(score(model.build(**at), inputs, targets, **how)))
-        return np.nan
+        with warnings.catch_warnings(action="ignore"):
+            try:
+                return -float(np.mean(score(model.build(**at), inputs, targets, **how)))
+            except ValueError as failed:
+                if "fits failed" not in str(failed):
+                    raise
+                return np.nan
 
     return fun
 
