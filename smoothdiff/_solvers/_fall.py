@@ -6,13 +6,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 # much is more than this share of the value, or of how far other values are above it
 _MUCH = 0.01
-# long ago is so many evaluations for each parameter, and one; where several run at once, so many
-# steps
+# long ago is so many evaluations for each parameter, and one, and no fewer than so many steps
 _LONG = 4
 
 
 class Fall(eqx.Module):
-    """The value `to` which the function last fell by much, and the evaluations `since`."""
+    """The value `to` which the function last fell by much, and the evaluations `since`.
+
+    It counts those that models ask for: steps and rounds of samples.
+    """
 
     to: Float[Array, ""]
     since: Int[Array, ""]

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from smoothdiff._params import Params
 from smoothdiff._solvers._base import all_finite
-from smoothdiff._solvers._box import bounds_of
+from smoothdiff._solvers._box import bounded, bounds_of
 from smoothdiff._solvers._fall import Fall
 from smoothdiff._solvers._first_points import CARRIED, NEARER, FirstPoints, others_nearer
 from smoothdiff._solvers._history import History
@@ -95,6 +95,8 @@ class ValueSearch(ValueState):
         known = eqx.tree_at(lambda s: s.turn, known, self.turn.more(sizes.step))
 
         def fall() -> Fall:
+            if self.look is None or not bounded(params):  # nobody asks
+                return self.fall
             history = known.history
             fun = jnp.where(jnp.any(history.valid), history.best(self.start)[2], jnp.inf)
             return self.fall.after(fun, history.usual(), sizes.step)
@@ -133,7 +135,9 @@ class ValueSearch(ValueState):
         apart = dataclasses.replace(known, turn=self.turn)
         branches = [first, local, wide, lambda: apart.piloted(params, new)]
         if self.look is not None:
-            branches.append(lambda: apart.after_look(params, sizes.step))
+            # the local model knows nothing of a place far away that is as good
+            lower = dataclasses.replace(new, valid=new.valid & (new.funs != before))
+            branches.append(lambda: self.kept(lower).after_look(params, sizes.step))
         if (scan := self.scan) is not None:
             funs = jnp.where(new.valid, new.funs, jnp.inf)
             branches.append(lambda: apart._scanned(params, scan.after(new.points, funs)))

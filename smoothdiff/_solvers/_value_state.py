@@ -220,14 +220,14 @@ class ValueState(AbstractLookingSearch):
         return self.converged() & look.is_far(params, self.history.best(self.start)[0])
 
     def look_due(self, params: Params, sizes: Sizes) -> Bool[Array, ""]:
-        """Also where the function hardly falls: to end the search may take long, and gain little.
+        """Also where the function hardly falls: the way to the end may be long, and gain little.
 
-        And between rounds, once the local model has failed: wide samples alone take long. Where a
-        round has shown noise both go on.
+        And between rounds, once the local model has failed: wide samples alone take long. Not where
+        a round has shown noise; before the first one nobody knows.
         """
         between = (self.stage == WIDE) & (self.rounds > 0) & (self.taken == 0)
         hardly = self.fall.long_ago(len(self.start), sizes.step)
-        # a model that predicts may be on its way through a long valley
+        # a model that predicts now may be on its way through a long valley
         hardly &= (self.is_local() | between) & ~self.trust.predicts()
         early = hardly | (between & self.trust.failed())
         return super().look_due(params, sizes) | (early & has_box(params) & ~self.noisy)
