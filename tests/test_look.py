@@ -10,7 +10,7 @@ import pytest
 
 import smoothdiff as sd
 from smoothdiff._params import take_apart
-from smoothdiff._solvers._fall import Fall
+from smoothdiff._solvers._fall import Fall, much
 from smoothdiff._solvers._look import Look
 from smoothdiff._solvers._stages import LOOK, TRUST, WIDE
 from tests.parts import quick_of
@@ -107,18 +107,23 @@ def test_no_look_comes_before_the_models_had_their_steps(history, at_once):
     assert stages.count(TRUST) + at_once * stages.count(WIDE) >= 12
 
 
+def fallen(fall, fun, usual, dtype=jnp.float32):
+    """After another evaluation."""
+    fun, usual = jnp.asarray(fun, dtype), jnp.asarray(usual, dtype)
+    return fall.after(fun, much(fun, usual), 1)
+
+
 def test_a_fall_is_much_beside_the_value_and_beside_others():
-    fall, usual = Fall.start(jnp.ones(())), jnp.asarray(1e6)
-    fall = fall.after(jnp.asarray(100.0), usual, 1)
+    fall = fallen(Fall.start(jnp.ones(())), 100.0, 1e6)
     assert (float(fall.to), int(fall.since)) == (100.0, 0)
     # little by little it becomes much
     for fun, to, since in [(99.5, 100, 1), (99.1, 100, 2), (98.9, 98.9, 0), (98.9, 98.9, 1)]:
-        fall = fall.after(jnp.asarray(fun), usual, 1)
+        fall = fallen(fall, fun, 1e6)
         assert (float(fall.to), int(fall.since)) == (pytest.approx(to), since)
     # one percent of the value is not asked for where others are hardly higher
-    assert int(fall.after(jnp.asarray(98.8), jnp.asarray(100.0), 1).since) == 0
+    assert int(fallen(fall, 98.8, 100.0).since) == 0
     # nor is anything less where the value is zero
-    assert int(fall.after(jnp.asarray(0.0), usual, 1).since) == 0
+    assert int(fallen(fall, 0.0, 1e6).since) == 0
     assert not fall.long_ago(2, 1)
     later = dataclasses.replace(fall, since=jnp.asarray(12))
     assert later.long_ago(2, 1)
@@ -130,9 +135,9 @@ def test_where_nothing_is_known_nothing_fell(dtype):
     with jax.enable_x64(dtype == jnp.float64):
         fall = Fall.start(jnp.zeros((), dtype))
         for _ in range(3):
-            fall = fall.after(jnp.asarray(jnp.inf, dtype), jnp.asarray(jnp.nan, dtype), 1)
+            fall = fallen(fall, jnp.inf, jnp.nan, dtype)
         assert (float(fall.to), int(fall.since), fall.since.dtype) == (jnp.inf, 3, jnp.int32)
-        known = fall.after(jnp.asarray(2.0, dtype), jnp.asarray(3.0, dtype), 1)
+        known = fallen(fall, 2.0, 3.0, dtype)
         assert (float(known.to), int(known.since)) == (2.0, 0)
         assert known.to.dtype == dtype
 

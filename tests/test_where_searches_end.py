@@ -115,7 +115,7 @@ def searched(dtype):
 
 @jax.jit
 def lowered(search, value, count):
-    points, rows, funs = (jnp.full(s, value, search.mark.dtype) for s in ((1, 3), (1, 1), (1,)))
+    points, rows, funs = (jnp.full(s, value, search.fall.to.dtype) for s in ((1, 3), (1, 1), (1,)))
     return search.kept(History(points, rows, funs, jnp.ones(1, bool))).marked(count)
 
 
@@ -124,15 +124,15 @@ def test_what_falls_little_by_little_is_no_sign_of_an_end_unless_all_is_rounding
     dtype, little, x64
 ):
     search = searched(dtype)
-    assert (int(search.stale), float(search.mark)) == (0, 1)
+    assert (int(search.fall.since), float(search.fall.to)) == (0, 1)
     stale = []
     for step in range(1, 5):
         search = lowered(search, 1 - little * step, 1)
-        stale.append(int(search.stale))
+        stale.append(int(search.fall.since))
     # a third of what is noticeable each
     assert stale == [1, 2, 0 if dtype == jnp.float32 else 3, 1 if dtype == jnp.float32 else 0]
     search = lowered(search, 2.0, 5)
-    assert int(search.stale) == stale[-1] + 5
+    assert int(search.fall.since) == stale[-1] + 5
 
 
 @pytest.mark.slow

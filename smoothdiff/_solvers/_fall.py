@@ -1,4 +1,4 @@
-"""When a function last fell by much: where that is long ago, little is left to find nearby."""
+"""When a function last fell: where that is long ago, little is left to do, or to find nearby."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,10 +11,7 @@ _LONG = 4
 
 
 class Fall(eqx.Module):
-    """The value `to` which the function last fell by much, and the evaluations `since`.
-
-    It counts those that models ask for: steps and rounds of samples.
-    """
+    """The value `to` which the function last fell by enough, and the evaluations `since`."""
 
     to: Float[Array, ""]
     since: Int[Array, ""]
@@ -24,14 +21,24 @@ class Fall(eqx.Module):
         """Nothing is known of the function."""
         return Fall(jnp.full_like(like, jnp.inf), jnp.zeros((), jnp.int32))
 
-    def after(self, fun: Float[Array, ""], usual: Float[Array, ""], count: int) -> "Fall":
-        """With so many evaluations, after which the lowest value and a usual one are these."""
-        # beside a height of no meaning every fall is little, but not beside the value
-        whole = jnp.minimum(usual - fun, jnp.abs(fun))
-        much = self.to - fun > _MUCH * whole
-        since = jnp.where(much, 0, self.since + count)
-        return Fall(jnp.where(much, fun, self.to), since.astype(self.since.dtype))
+    def after(self, fun: Float[Array, ""], enough: Float[Array, ""], count: int) -> "Fall":
+        """With so many evaluations more.
+
+        Args:
+            fun: the lowest value now, infinite where there is none.
+            enough: by more than that a fall counts, also little by little.
+            count: the evaluations.
+        """
+        fell = self.to - fun > enough
+        since = jnp.where(fell, 0, self.since + count)
+        return Fall(jnp.where(fell, fun, self.to), since.astype(self.since.dtype))
 
     def long_ago(self, n: int, count: int) -> Bool[Array, ""]:
         """Whether that is long ago, with n parameters and so many evaluations at once."""
         return self.since >= _LONG * max(n + 1, count)
+
+
+def much(fun: Float[Array, ""], usual: Float[Array, ""]) -> Float[Array, ""]:
+    """A fall to this value is much if it is more, where a usual value is that."""
+    # beside a height of no meaning every fall is little, but not beside the value
+    return _MUCH * jnp.minimum(usual - fun, jnp.abs(fun))

@@ -99,7 +99,11 @@ class History(eqx.Module):
 
     def went_lower(self, other: "History") -> Bool[Array, ""]:
         """Whether the lowest value is lower than that of another history."""
-        return jnp.min(self._known()) < jnp.min(other._known())
+        return self.least() < other.least()
+
+    def least(self) -> Float[Array, ""]:
+        """The lowest value, infinite where there is none."""
+        return jnp.min(self._known())
 
     def usual(self) -> Float[Array, ""]:
         """A value as most places have it: the highest of three quarters."""

@@ -11,11 +11,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
 from smoothdiff._solvers._averaging import Average
+from smoothdiff._solvers._fall import Fall
 from smoothdiff._solvers._first_points import FirstPoints
 from smoothdiff._solvers._history import History, hardly_differ
 from smoothdiff._solvers._look import Look
 from smoothdiff._solvers._pilot import Pilot
-from smoothdiff._solvers._ratio_test import is_noticeable
+from smoothdiff._solvers._ratio_test import noticeable
 from smoothdiff._solvers._stages import FIRST, LOOK, PILOT, TRUST, Sizes
 
 # so many small steps in a row count as convergence
@@ -35,9 +36,8 @@ class AbstractPointSearch(eqx.Module):
     points again if it found something else. There may be one `look`. `trust` has a local model, and
     how far it is trusted.
 
-    `evaluated` counts the evaluations, `small` the small steps in a row. The `mark` is the lowest
-    value when it last fell noticeably, and `stale` counts the evaluations since.
-    There is an `average` if the function takes random numbers.
+    `evaluated` counts the evaluations, `small` the small steps in a row. The `fall` says when the
+    function last fell noticeably. There is an `average` if the function takes random numbers.
     """
 
     stage: Int[Array, ""]
@@ -46,8 +46,7 @@ class AbstractPointSearch(eqx.Module):
     first: FirstPoints
     evaluated: Int[Array, ""]
     small: Int[Array, ""]
-    stale: Int[Array, ""]
-    mark: Float[Array, ""]
+    fall: Fall
     pilot: Pilot
     average: Average | None
     look: Look | None
@@ -184,10 +183,8 @@ class AbstractPointSearch(eqx.Module):
 
     def marked(self, count: int) -> Any:
         """With so many evaluations that may have lowered the function, also little by little."""
-        fun = self.history.best(self.start)[2]
-        lower = jnp.any(self.history.valid) & is_noticeable(self.mark - fun, fun)
-        waited = jnp.where(lower, 0, self.stale + count), jnp.where(lower, fun, self.mark)
-        return eqx.tree_at(lambda s: (s.stale, s.mark), self, waited)
+        fun = self.history.least()
+        return dataclasses.replace(self, fall=self.fall.after(fun, noticeable(fun), count))
 
     def kept(self, new: History) -> Any:
         """With these evaluations in the history instead of the oldest."""

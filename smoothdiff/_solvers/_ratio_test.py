@@ -105,10 +105,10 @@ def is_lower(fun: Float[Array, ""], before: Float[Array, ""]) -> Bool[Array, ""]
     return before - fun > _NOTHING * jnp.finfo(fun.dtype).eps * jnp.abs(before)
 
 
-def is_noticeable(reduction: Float[Array, ""], fun: Float[Array, ""]) -> Bool[Array, ""]:
-    """Whether a reduction to this value, in many evaluations, is any progress."""
+def noticeable(fun: Float[Array, ""]) -> Float[Array, ""]:
+    """A reduction to this value, in many evaluations, is progress if it is more."""
     share = max(_PROGRESS, _NOTHING * _NOTHING * float(jnp.finfo(fun.dtype).eps))
-    return reduction > share * jnp.abs(fun)
+    return share * jnp.abs(fun)
 
 
 def are_level(funs: Float[Array, " K"], valid: Bool[Array, " K"]) -> Bool[Array, ""]:

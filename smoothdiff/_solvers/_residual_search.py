@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
+from smoothdiff._solvers._fall import Fall
 from smoothdiff._solvers._first_points import FARTHER, FirstPoints
 from smoothdiff._solvers._history import History, alike
 from smoothdiff._solvers._looking_search import AbstractLookingSearch
@@ -55,8 +56,7 @@ class ResidualSearch(AbstractLookingSearch):
             wide=Wide.start(theta, jnp.zeros(size, theta.dtype), jnp.ones_like(theta)),
             turn=Turn.start(n, one),
             small=none,
-            stale=none,
-            mark=jnp.full_like(one, jnp.inf),
+            fall=Fall.start(one),
             pilot=Pilot.start(theta),
             average=None,
             look=None,
@@ -101,7 +101,7 @@ class ResidualSearch(AbstractLookingSearch):
 
     def lost(self, sizes: Sizes) -> Bool[Array, ""]:
         """Whether it converged, or so many evaluations in a row were hardly lower."""
-        return self.converged() | (self.stale >= sizes.patience)
+        return self.converged() | (self.fall.since >= sizes.patience)
 
     def counted(self, small: Array, teaches: Array, last: Array, count: int) -> "ResidualSearch":
         """Before the minimum of a ripple is taken for the answer, wide rounds look around once."""

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 from smoothdiff._params import Params
 from smoothdiff._solvers._base import all_finite
 from smoothdiff._solvers._box import bounded, bounds_of
-from smoothdiff._solvers._fall import Fall
+from smoothdiff._solvers._fall import Fall, much
 from smoothdiff._solvers._first_points import CARRIED, NEARER, FirstPoints, others_nearer
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import differ
@@ -94,12 +94,11 @@ class ValueSearch(ValueState):
         known = self.kept(new)
         known = eqx.tree_at(lambda s: s.turn, known, self.turn.more(sizes.step))
 
-        def fall() -> Fall:
+        def fallen() -> Fall:
             if self.look is None or not bounded(params):  # nobody asks
-                return self.fall
-            history = known.history
-            fun = jnp.where(jnp.any(history.valid), history.best(self.start)[2], jnp.inf)
-            return self.fall.after(fun, history.usual(), sizes.step)
+                return self.much
+            fun = known.history.least()
+            return self.much.after(fun, much(fun, known.history.usual()), sizes.step)
 
         def first() -> "ValueSearch":
             first = self.first.known(sizes.step)
@@ -119,15 +118,15 @@ class ValueSearch(ValueState):
             trust = self.trust.revise(proposal, before, new.funs, new.valid)
             slow = jnp.where(known.at_bottom(sizes, self.trust.radius), _ENOUGH, trust.slow)
             trust = eqx.tree_at(lambda t: t.slow, trust, slow)
-            changed = trust, known.history.best(self.start)[0], fall()
-            after = eqx.tree_at(lambda s: (s.trust, s.place, s.fall), known, changed)
+            changed = trust, known.history.best(self.start)[0], fallen()
+            after = eqx.tree_at(lambda s: (s.trust, s.place, s.much), known, changed)
             return after._turned(params, sizes)
 
         def wide() -> "ValueSearch":
             taken = self.taken + sizes.step
             noisy = self.noisy | (self.checks_noise() & new.valid[0] & differ(new.funs[0], before))
-            changed = taken, noisy, fall()
-            more = eqx.tree_at(lambda s: (s.taken, s.noisy, s.fall), known, changed)
+            changed = taken, noisy, fallen()
+            more = eqx.tree_at(lambda s: (s.taken, s.noisy, s.much), known, changed)
             full = lambda: more._stepped(params, sizes)._turned(params, sizes)
             return jax.lax.cond(taken >= sizes.first, full, lambda: more)
 
@@ -149,8 +148,8 @@ class ValueSearch(ValueState):
         goes_on = scan.failed & (self.searches == 0)
         stage = jnp.where(goes_on, WIDE, self.stage).astype(self.stage.dtype)
         # what a scan is to find is no point that is lower
-        new = stage, jnp.where(goes_on, 0, self.stale)
-        known = eqx.tree_at(lambda s: (s.stage, s.stale), known, new)
+        new = stage, jnp.where(goes_on, 0, self.fall.since)
+        known = eqx.tree_at(lambda s: (s.stage, s.fall.since), known, new)
         first = FirstPoints.start(scan.found, SIDES)
         first = dataclasses.replace(first, reach=scan.nearest / params.sigma)
         anew = known.anew(params, scan.found, first, jnp.ones_like(scan.fun))

@@ -48,7 +48,8 @@ class ValueState(AbstractLookingSearch):
     is low. Nor does any search where the function is `noisy`: where it gave another value for the
     same point, which the first round of samples begins with. Parameters are `unchanging` whose
     first points had the value of the start. First points that are left are `near` times as far as
-    sigma says. `fall` is of the steps and rounds of this search.
+    sigma says. `much` says when the function last fell by
+    much, in steps and rounds of this search.
     """
 
     scan: Scan | None
@@ -56,7 +57,7 @@ class ValueState(AbstractLookingSearch):
     noisy: Bool[Array, ""]
     unchanging: Bool[Array, " n"]
     near: Float[Array, ""]
-    fall: Fall
+    much: Fall
     trust: QuadraticTrust
     place: Float[Array, " n"]
     center: Center
@@ -88,8 +89,7 @@ class ValueState(AbstractLookingSearch):
             start=theta,
             evaluated=none,
             small=none,
-            stale=none,
-            mark=jnp.full_like(never, jnp.inf),
+            fall=Fall.start(never),
             pilot=Pilot.start(theta),
             average=None,
             look=None,
@@ -99,7 +99,7 @@ class ValueState(AbstractLookingSearch):
             noisy=jnp.asarray(False),
             unchanging=jnp.zeros(n, bool),
             near=jnp.ones_like(never),
-            fall=Fall.start(never),
+            much=Fall.start(never),
             trust=QuadraticTrust.start(sigma, width),
             place=theta,
             center=center,
@@ -226,7 +226,7 @@ class ValueState(AbstractLookingSearch):
         a round has shown noise; before the first one nobody knows.
         """
         between = (self.stage == WIDE) & (self.rounds > 0) & (self.taken == 0)
-        hardly = self.fall.long_ago(len(self.start), sizes.step)
+        hardly = self.much.long_ago(len(self.start), sizes.step)
         # a model that predicts now may be on its way through a long valley
         hardly &= (self.is_local() | between) & ~self.trust.predicts()
         early = hardly | (between & self.trust.failed())
@@ -235,11 +235,11 @@ class ValueState(AbstractLookingSearch):
     def lost(self, sizes: Sizes) -> Bool[Array, ""]:
         """Whether neither model leads anywhere; after one converged the wide one may yet."""
         narrow = is_narrow(self.center.trust.width) & ~self.noisy
-        lost = self.center.lost(sizes) | (narrow & (self.stale >= sizes.patience))
+        lost = self.center.lost(sizes) | (narrow & (self.fall.since >= sizes.patience))
         lost &= self.trust.failed() | self.later()
         # the smoothed function may fall for long where the function itself does not
         searches = (self.is_local() | (self.stage == WIDE)) & (self.rounds > 0) & ~self.noisy
-        lost |= searches & (self.stale >= _PATIENCES * sizes.patience)
+        lost |= searches & (self.fall.since >= _PATIENCES * sizes.patience)
         return lost if self.scan is None else lost | (self.scan.failed & (self.stage == SCAN))
 
     def patient(self, searches: Int[Array, ""]) -> Bool[Array, ""]:
