@@ -15,7 +15,8 @@ from tqdm import tqdm
 from smoothdiff._grey_cases import CaseSearches
 from smoothdiff._grey_lessons import Learner, Lessons
 from smoothdiff._grey_result import GreyBoxError, GreyRecord, GreyResult
-from smoothdiff._grey_run import Answer, GreyRun, GreyState, Shown, lessons_of
+from smoothdiff._grey_run import Answer, GreyRun, GreyState, Shown
+from smoothdiff._grey_sensitivity import Sensitivity
 from smoothdiff._host_samples import BlackBoxError
 from smoothdiff._params import as_key, take_apart
 
@@ -46,7 +47,7 @@ def train_grey_box(
 
     $$ \min_\phi \frac1C \sum_c \| R(g_\phi(I_c)) - I_c \|^2, \qquad
        x_c \approx \arg\min_x \| R(x) - I_c \|^2, \qquad
-       \phi \approx \arg\min_\phi \sum_i h(g_\phi(R(x_i)) - x_i) $$
+       \phi \approx \arg\min_\phi \sum_{ij} s_j h(g_\phi(R(x_i))_j - x_{ij}) $$
 
     A case is a picture I. AD can differentiate the network g, and not the renderer R. So the
     problem is split in two:
@@ -56,12 +57,15 @@ def train_grey_box(
       stays in a wrong valley. Where the network's answer is nearer, the search goes on from there.
     - **Lessons.** The network learns by AD, without a render, to answer the best parameters that
       are known. A render is a picture whose parameters are known, so it learns from renders too:
-      from all whose parameters are within the range of the best ones. h is Huber's loss.
+      from all whose parameters are within the range of the best ones. h is Huber's loss of each
+      parameter, times how much the picture changes with it.
 
     The renders of the searches soon look like the pictures themselves. So half of all renders are
     of new parameters, drawn from a kernel density estimate of the best ones. The network then sees
     as many different pictures as there are renders, and does better on pictures that it has not
-    seen. In each round some cases take a step, and then the network gets its lessons.
+    seen. One in ten of these or fewer are earlier ones with one parameter moved by as much as the
+    network is usually off in it: they say how much a picture changes. In each round some cases take
+    a step, and then the network gets its lessons.
 
     Args:
         model: the network: `model(picture)` gives the parameters of the renderer, an array or a
@@ -77,9 +81,7 @@ def train_grey_box(
         max_evaluations: the most renders, never exceeded. Lessons are planned for that many.
         optim: an optax transformation. By default Adam, whose rate falls from 3e-3 to 6e-5 over the
             lessons.
-        lessons: updates of the network in a round, each on 64 pictures, on average over the rounds:
-            an eighth of these in the first, where there is little to learn yet, and twice as many
-            in the last.
+        lessons: updates of the network in a round, each on 64 pictures.
         cases: how many cases take a step in a round.
         kept: how many of the last renders to remember, with their pictures. With 0 there are no new
             parameters, and a case learns from its own renders alone. That is for pictures which no
@@ -142,15 +144,12 @@ def train_grey_box(
             f"max_evaluations={max_evaluations} leaves no room for a round, which takes "
             f"{searches.evaluations} renders: allow more, or lower cases"
         )
-    if optim is None:
-        total = sum(lessons_of(i, planned, lessons) for i in range(planned))
-        used = _adam(total)
-    else:
-        used = optim
+    used = _adam(planned * lessons) if optim is None else optim
     taught = Lessons(answer, pictures, used)
-    known, rendered = searches.begin(key, taught.answers(weights))
+    known, rendered = searches.begin(key, taught.answers(weights, pictures))
     none = jnp.zeros((), jnp.int32)
-    state = GreyState(none, Learner.start(weights, used), known, rendered)
+    alike = Sensitivity.start(known.best[0])
+    state = GreyState(none, Learner.start(weights, used), known, rendered, alike)
     run = GreyRun(searches, taught, answer, key, state, planned, lessons)
     if checkpoint is not None:
         settings = lessons, cases, kept, new_parameters

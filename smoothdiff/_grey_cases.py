@@ -82,6 +82,11 @@ class CaseSearches(eqx.Module):
         return self.samples + 2 if self.new else 0
 
     @property
+    def moves(self) -> bool:
+        """Whether one of these is a render that is made again with one parameter moved."""
+        return self.new and self.size > 1
+
+    @property
     def evaluations(self) -> int:
         """Renders of a round; a search also has where it was, and the network's answer."""
         return self.drawn * (self.samples + 2 + self.fresh)
@@ -115,11 +120,19 @@ class CaseSearches(eqx.Module):
         chosen: Int[Array, " drawn"],
         known: Known,
         rendered: Rendered,
-    ) -> tuple[Known, Rendered, Float[Array, " drawn"]]:
-        """Steps of some cases, of which the network has said this; and the losses of that."""
+        moved: Float[Array, "drawn n"],
+    ) -> tuple[Known, Rendered, Float[Array, " drawn"], Float[Array, "drawn ..."]]:
+        """Steps of some cases, of which the network has said this; and the losses of that.
+
+        Of each case's new parameters one makes way for those that are `moved`, but where these are
+        NaN. What is last is how they look.
+        """
         draw, *keys = jax.random.split(key, self.drawn + 1)
         # at first nothing is known, and these are all but what the untrained network says
         others = like(draw, known.best, (self.drawn, self.fresh))
+        if self.moves:
+            there = jnp.isfinite(moved).all(axis=1)
+            others = others.at[:, 0].set(jnp.where(there[:, None], moved, others[:, 0]))
         best, loss, at, searches = (
             jax.tree.map(lambda leaf: leaf[chosen], part)
             for part in (known.best, known.loss, known.at, known.searches)
@@ -135,7 +148,21 @@ class CaseSearches(eqx.Module):
             known.at.at[chosen].set(at),
             jax.tree.map(lambda leaf, part: leaf.at[chosen].set(part), known.searches, searches),
         )
-        return known, rendered.after(flat(points), flat(shown)), answered
+        # where it was and the network's answer come first
+        return known, rendered.after(flat(points), flat(shown)), answered, shown[:, 2]
+
+    @eqx.filter_jit
+    def again(
+        self, key: Key[Array, ""], known: Known, rendered: Rendered
+    ) -> tuple[Float[Array, "drawn n"], Float[Array, "drawn ..."]]:
+        """Some renders within the range of what is known, to be made again; NaN without any."""
+        if not self.moves:
+            like = (known.best[: self.drawn], self.pictures[: self.drawn])
+            return jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), like)
+        # where none is within the range any will do, and at first all are NaN
+        share = jnp.maximum(rendered.within(known.best).astype(known.best.dtype), 1e-9)
+        number = jax.random.choice(key, len(share), (self.drawn,), p=share / jnp.sum(share))
+        return jax.tree.map(lambda leaf: leaf[number], (rendered.points, rendered.shown))
 
     def agree(self, known: Known) -> bool:
         """Whether a case that is known still has the loss that it had, but for rounding."""

@@ -2,8 +2,9 @@
 
 For a picture of a case that is the best that was found, for a render what was rendered. So it has
 as many pictures to learn from as there were renders, of which those within the range of what is
-known to be best count. The weights of late lessons are averaged (Shamir and Zhang, Stochastic
-gradient descent for non-smooth optimization, 2013).
+known to be best count. All count alike: the cases, whose answers are not quite right, are soon few
+among the renders. The weights of late lessons are averaged (Shamir and Zhang, Stochastic gradient
+descent for non-smooth optimization, 2013).
 """
 
 from collections.abc import Callable
@@ -18,8 +19,8 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from smoothdiff._grey_cases import Known, Rendered
 from smoothdiff._solvers._base import promotion
 
-# cases in a lesson, and renders
-_CASES, _RENDERS = 16, 48
+# pictures in a lesson
+_PICTURES = 64
 # an error beyond so many sigmas may be the search's
 _DOUBT = 0.2
 # in the mean of all weights those after t lessons count about as the ninth power of t
@@ -57,10 +58,9 @@ class Lessons(eqx.Module):
 
     @eqx.filter_jit
     def answers(
-        self, weights: PyTree[Array], chosen: Int[Array, " k"] | None = None
+        self, weights: PyTree[Array], pictures: Float[Array, "k ..."]
     ) -> Float[Array, "k n"]:
-        """What the network says of some cases, or of all."""
-        pictures = self.pictures if chosen is None else self.pictures[chosen]
+        """What the network says of pictures."""
         return jax.vmap(lambda picture: self.answer(weights, picture))(pictures)
 
     @eqx.filter_jit
@@ -71,14 +71,17 @@ class Lessons(eqx.Module):
         best: Float[Array, "cases n"],
         rendered: Rendered,
         within: Bool[Array, " kept"],
+        counts: Float[Array, " n"],
     ) -> tuple[Learner, Float[Array, ""]]:
-        """One step of the optimiser on cases and renders that are drawn; and the misfit before."""
-        inputs, targets, weight = self._drawn(key, best, rendered, within)
+        """One step of the optimiser on cases and renders that are drawn; and the misfit before.
+
+        An error in a parameter counts so many times.
+        """
+        inputs, targets = self._drawn(key, best, rendered, within)
 
         def misfit(weights: PyTree) -> Array:
-            said = jax.vmap(lambda picture: self.answer(weights, picture))(inputs)
-            each = optax.huber_loss(said, targets, delta=_DOUBT)
-            return jnp.mean(weight[:, None] * each)
+            each = optax.huber_loss(self.answers(weights, inputs), targets, delta=_DOUBT)
+            return jnp.mean(counts[None] * each)
 
         value, slope = jax.value_and_grad(misfit)(learner.weights)
         with promotion():
@@ -94,25 +97,19 @@ class Lessons(eqx.Module):
 
     def _drawn(
         self, key: Array, best: Array, rendered: Rendered, within: Array
-    ) -> tuple[Array, Array, Array]:
-        """Pictures, answers, and what each counts: of renders, those within the range."""
-        of_cases, of_renders = jax.random.split(key)
-        kept = len(rendered.points)
-        count = _CASES if kept else _CASES + _RENDERS
-        case = jax.random.choice(of_cases, len(self.pictures), (count,))
-        inputs, targets = self.pictures[case], best[case]
-        weight = jnp.ones(count, best.dtype)
-        if not kept:
-            return inputs, targets, weight
-        share = within.astype(best.dtype)
-        # where there are no renders to learn from, what is drawn has no weight
-        number = jax.random.choice(of_renders, kept, (_RENDERS,), p=share / jnp.sum(share))
-        there = within[number]
-        spread = there.reshape(-1, *(1,) * (inputs.ndim - 1))
-        shown = jnp.where(spread, rendered.shown[number], 0).astype(inputs.dtype)
-        points = jnp.where(there[:, None], rendered.points[number], 0)
-        weight = jnp.append(weight, there.astype(best.dtype))
-        return jnp.append(inputs, shown, axis=0), jnp.append(targets, points, axis=0), weight
+    ) -> tuple[Array, Array]:
+        """Pictures and answers: of cases, and of renders that are within the range."""
+        cases, kept = len(self.pictures), len(rendered.points)
+        share = jnp.append(jnp.ones(cases, best.dtype), within.astype(best.dtype))
+        number = jax.random.choice(key, cases + kept, (_PICTURES,), p=share / jnp.sum(share))
+        inputs, targets = self.pictures[number], best[number]
+        if kept:
+            of_case, render = number < cases, number - cases
+            spread = of_case.reshape(-1, *(1,) * (inputs.ndim - 1))
+            shown = rendered.shown[render].astype(inputs.dtype)
+            inputs = jnp.where(spread, inputs, shown)
+            targets = jnp.where(of_case[:, None], targets, rendered.points[render])
+        return inputs, targets
 
 
 def mean_loss(known: Known) -> Float[Array, ""]:

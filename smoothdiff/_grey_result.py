@@ -17,7 +17,8 @@ class GreyRecord(NamedTuple):
             and the pictures, over the cases of this round. The network is that of before this
             round's lessons.
         known: the lowest loss of any render, averaged over all cases.
-        misfit: Huber's loss of the network's answers to the best parameters, in the last lesson.
+        misfit: what the network learns to make small, in the last lesson: Huber's loss of its
+            answers, each parameter weighted by how much a picture changes with it.
         model: the network after the round, with averaged weights; None in the history.
 
     Example:

@@ -16,14 +16,13 @@ from smoothdiff._checkpoint import Checkpoint
 from smoothdiff._grey_cases import CaseSearches, Known, Rendered
 from smoothdiff._grey_lessons import Learner, Lessons, mean_loss
 from smoothdiff._grey_result import GreyRecord, GreyResult
+from smoothdiff._grey_sensitivity import Moved, Sensitivity
 from smoothdiff._identity import listed
 from smoothdiff._layout import Layout
 from smoothdiff._reraise import reraise
 
 # the share of the time that saving may take
 _SAVING = 0.05
-# lessons of the first round and of the last one, in those of a round in the mean
-_FIRST, _LAST = 0.125, 1.875
 
 
 class Answer(eqx.Module):
@@ -58,6 +57,7 @@ class GreyState(eqx.Module):
     learner: Learner
     known: Known
     rendered: Rendered
+    sensitivity: Sensitivity
 
 
 @dataclasses.dataclass
@@ -70,7 +70,7 @@ class GreyRun:
     key: Key[Array, ""]
     state: GreyState
     planned: int  # rounds
-    each: int  # lessons of a round, in the mean
+    each: int  # lessons of a round
     history: list[GreyRecord] = dataclasses.field(default_factory=list)
     start: float = dataclasses.field(default_factory=time.monotonic)
     file: Checkpoint | None = None
@@ -101,20 +101,25 @@ class GreyRun:
 
     def _round(self) -> tuple[GreyState, GreyRecord]:
         key, state = jax.random.fold_in(self.key, self.rounds), self.state
-        solving, learning = jax.random.split(key)
+        solving, learning, moving = jax.random.split(key, 3)
         chosen = self.searches.chosen(state.rounds)
-        said = self.lessons.answers(state.learner.mean, chosen)
-        known, rendered, answered = self.searches.step(
-            solving, said, chosen, state.known, state.rendered
+        said = self.lessons.answers(state.learner.mean, self.lessons.pictures[chosen])
+        points, before = self.searches.again(moving, state.known, state.rendered)
+        moved = Moved.of(moving, points, self.lessons.answers(state.learner.mean, before))
+        known, rendered, answered, after = self.searches.step(
+            solving, said, chosen, state.known, state.rendered, moved.points
         )
+        change = jnp.mean((after - before).reshape(len(after), -1) ** 2, axis=1)
+        sensitivity = state.sensitivity.after(moved, change)
         within, learner = rendered.within(known.best), state.learner
-        misfit = jnp.nan
-        count = lessons_of(self.rounds, self.planned, self.each)
-        keys = jax.random.split(learning, count)
+        counts, misfit = sensitivity.weights(), jnp.nan
         # one by one: to iterate over an array compiles a program of as many outputs, each round
-        for i in range(count):
-            learner, misfit = self.lessons.teach(keys[i], learner, known.best, rendered, within)
-        new = GreyState(state.rounds + 1, learner, known, rendered)
+        keys = jax.random.split(learning, self.each)
+        for i in range(self.each):
+            learner, misfit = self.lessons.teach(
+                keys[i], learner, known.best, rendered, within, counts
+            )
+        new = GreyState(state.rounds + 1, learner, known, rendered, sensitivity)
         record = GreyRecord(
             round=self.rounds + 1,
             evaluations=self.evaluations + self.searches.evaluations,
@@ -173,12 +178,3 @@ class GreyRun:
             warnings.warn(text, RuntimeWarning, stacklevel=2)
         after = time.monotonic()
         self.save_due = after + (after - before) / _SAVING
-
-
-def lessons_of(number: int, planned: int, each: int) -> int:
-    """How many a round has: more as there is more to learn, and those of the last one from there.
-
-    In the mean over all that are planned, `each`.
-    """
-    share = min(number / (planned - 1), 1.0) if planned > 1 else 0.5
-    return max(round(each * (_FIRST + (_LAST - _FIRST) * share)), 1)

@@ -1,0 +1,70 @@
+"""How much a picture changes with each parameter: what an error of the network costs.
+
+A network that is off by e in one parameter alone pays s e^2. Here s depends on the size of e: where
+edges move a picture changes by about |e|. So s is measured where it is needed. Some renders are
+made again with one parameter moved by as much as the network is usually off in it. The mean squared
+difference of the two pictures, over e^2, is s.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, Key
+
+# what earlier rounds count, relative to those after them: the network's errors become smaller
+_MEMORY = 0.8
+# so many pairs say that a parameter is like the others
+_ALIKE = 2
+# no parameter counts less than this share of the mean
+_LEAST = 0.01
+
+
+class Moved(NamedTuple):
+    """Parameters of which one is moved, which it is, and by how much, up to the sign."""
+
+    points: Float[Array, "k n"]
+    entry: Int[Array, " k"]
+    distance: Float[Array, " k"]
+
+    @staticmethod
+    def of(key: Key[Array, ""], points: Float[Array, "k n"], said: Float[Array, "k n"]) -> "Moved":
+        """Of these, of whose renders the network says that; NaN where nothing is known."""
+        error = said - points
+        usual = jnp.sqrt(jnp.nanmean(error**2, axis=0))
+        k, n = points.shape
+        # all parameters in turn, the first at random
+        entry = (jnp.arange(k) + jax.random.randint(key, (), 0, n)) % n
+        one = jax.nn.one_hot(entry, n, dtype=bool)
+        moved = jnp.where(one, points + jnp.where(error < 0, -usual[None], usual[None]), points)
+        return Moved(moved, entry, usual[entry])
+
+
+class Sensitivity(eqx.Module):
+    """What the pairs of all rounds say, for each parameter: a sum, and how many they are."""
+
+    total: Float[Array, " n"]
+    pairs: Float[Array, " n"]
+
+    @staticmethod
+    def start(point: Float[Array, " n"]) -> "Sensitivity":
+        """No pair yet."""
+        return Sensitivity(jnp.zeros_like(point), jnp.zeros_like(point))
+
+    @eqx.filter_jit
+    def after(self, moved: Moved, change: Float[Array, " k"]) -> "Sensitivity":
+        """With these, and the mean squared change of each picture, NaN where nothing is known."""
+        found = change / moved.distance**2
+        good = jnp.isfinite(found)
+        add = lambda x: jnp.zeros_like(self.total).at[moved.entry].add(jnp.where(good, x, 0))
+        return Sensitivity(_MEMORY * self.total + add(found), _MEMORY * self.pairs + add(1.0))
+
+    @eqx.filter_jit
+    def weights(self) -> Float[Array, " n"]:
+        """What each parameter counts, one in the mean; all the same while nothing is known."""
+        usual = jnp.sum(self.total) / jnp.maximum(jnp.sum(self.pairs), 1)
+        usual = jnp.where(usual > 0, usual, 1)
+        found = (self.total + _ALIKE * usual) / (self.pairs + _ALIKE)
+        found = jnp.maximum(found / jnp.mean(found), _LEAST)
+        return found / jnp.mean(found)
