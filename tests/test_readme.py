@@ -142,7 +142,8 @@ def headings(page):
 @pytest.mark.parametrize("page", PAGES, ids=named)
 def test_commands_are_understood(page):
     for said in re.findall(SAID, page.read_text()):
-        # any task stands for all where a page says TASK
+        # a shell joins lines; any task stands for all where a page says TASK
+        said = said.replace("\\\n", " ")
         options = cli.parser().parse_args(re.sub(r"\bTASK\b", "led", said).split())
         methods = getattr(options, "methods", None)
         known = {*_registry.methods(), *profiles.METHODS, *ablations.methods()}
