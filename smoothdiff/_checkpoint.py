@@ -49,6 +49,8 @@ class Checkpoint:
             raise self.other(f"its {listed(differ)} differed")
         self._identity.parts = kept
         leaves, treedef = jax.tree.flatten(like)
+        if len(arrays) != len(leaves):
+            raise self.other("its state is that of another version")
         return treedef.unflatten(map(_restore, arrays, leaves))
 
     def other(self, how: str) -> ValueError:

@@ -57,28 +57,29 @@ def train_grey_box(
       stays in a wrong valley. Where the network's answer is nearer, the search goes on from there.
     - **Lessons.** The network learns by AD, without a render, to answer the best parameters that
       are known. A render is a picture whose parameters are known, so it learns from renders too:
-      from all whose parameters are within the range of the best ones. h is Huber's loss of each
-      parameter, times how much the picture changes with it.
+      from all whose parameters are within the range of the best ones. h is Huber's loss, and
+      s_j is how much a picture changes with parameter j, one in the mean.
 
     The renders of the searches soon look like the pictures themselves. So half of all renders are
     of new parameters, drawn from a kernel density estimate of the best ones. The network then sees
     as many different pictures as there are renders, and does better on pictures that it has not
-    seen. One in ten of these or fewer are earlier ones with one parameter moved by as much as the
-    network is usually off in it: they say how much a picture changes. In each round some cases take
-    a step, and then the network gets its lessons.
+    seen. At most one in eight of these are earlier ones with one parameter moved by as much as the
+    network is usually off in it: s is measured with them. In each round some cases take a step, and
+    then the network gets its lessons.
 
     Args:
         model: the network: `model(picture)` gives the parameters of the renderer, an array or a
             pytree. Any pytree with arrays of floating-point numbers, such as a module of equinox.
             It is not changed; the trained one is in the result.
         render: the renderer, from these parameters to a picture, a JAX function or a `black_box`.
-            Renders that are NaN or infinite are left out.
+            Renders that are NaN or infinite are left out. The same parameters should give the same
+            picture: of a random renderer fix the seed.
         pictures: the training pictures, an array whose first axis counts the cases; each has the
             shape of a render.
         key: a random key; the same key gives the same training.
         sigma: how far from an answer to look, in the units of the parameters: a number or a pytree
             like them.
-        max_evaluations: the most renders, never exceeded. Lessons are planned for that many.
+        max_evaluations: the most renders, never exceeded. Adam's rate falls until then.
         optim: an optax transformation. By default Adam, whose rate falls from 3e-3 to 6e-5 over the
             lessons.
         lessons: updates of the network in a round, each on 64 pictures.
@@ -87,7 +88,7 @@ def train_grey_box(
             parameters, and a case learns from its own renders alone. That is for pictures which no
             render looks like.
         new_parameters: whether half of all renders are of new parameters. These renders teach the
-            network alone; the searches gain nothing from them.
+            network alone; the searches gain nothing from them. Without them all s are one.
         target: a loss that is good enough: the mean over the cases of a round, of the network's
             answers.
         max_seconds: seconds after which no further round begins.

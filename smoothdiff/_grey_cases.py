@@ -124,8 +124,8 @@ class CaseSearches(eqx.Module):
     ) -> tuple[Known, Rendered, Float[Array, " drawn"], Float[Array, "drawn ..."]]:
         """Steps of some cases, of which the network has said this; and the losses of that.
 
-        Of each case's new parameters one makes way for those that are `moved`, but where these are
-        NaN. What is last is how they look.
+        The first new parameters of each case are replaced by `moved`, unless that is NaN. Returned
+        last: the renders of these.
         """
         draw, *keys = jax.random.split(key, self.drawn + 1)
         # at first nothing is known, and these are all but what the untrained network says
@@ -149,7 +149,12 @@ class CaseSearches(eqx.Module):
             jax.tree.map(lambda leaf, part: leaf.at[chosen].set(part), known.searches, searches),
         )
         # where it was and the network's answer come first
-        return known, rendered.after(flat(points), flat(shown)), answered, shown[:, 2]
+        return (
+            known,
+            rendered.after(flat(points), flat(shown)),
+            answered,
+            shown[:, 2].astype(self.pictures.dtype),
+        )
 
     @eqx.filter_jit
     def again(
@@ -157,12 +162,12 @@ class CaseSearches(eqx.Module):
     ) -> tuple[Float[Array, "drawn n"], Float[Array, "drawn ..."]]:
         """Some renders within the range of what is known, to be made again; NaN without any."""
         if not self.moves:
-            like = (known.best[: self.drawn], self.pictures[: self.drawn])
-            return jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), like)
+            some = (known.best[: self.drawn], self.pictures[: self.drawn])
+            return jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), some)
         # where none is within the range any will do, and at first all are NaN
         share = jnp.maximum(rendered.within(known.best).astype(known.best.dtype), 1e-9)
         number = jax.random.choice(key, len(share), (self.drawn,), p=share / jnp.sum(share))
-        return jax.tree.map(lambda leaf: leaf[number], (rendered.points, rendered.shown))
+        return rendered.points[number], rendered.shown[number].astype(self.pictures.dtype)
 
     def agree(self, known: Known) -> bool:
         """Whether a case that is known still has the loss that it had, but for rounding."""

@@ -102,13 +102,14 @@ class Lessons(eqx.Module):
         cases, kept = len(self.pictures), len(rendered.points)
         share = jnp.append(jnp.ones(cases, best.dtype), within.astype(best.dtype))
         number = jax.random.choice(key, cases + kept, (_PICTURES,), p=share / jnp.sum(share))
-        inputs, targets = self.pictures[number], best[number]
+        case, render = number % cases, number - cases
+        inputs, targets = self.pictures[case], best[case]
         if kept:
-            of_case, render = number < cases, number - cases
-            spread = of_case.reshape(-1, *(1,) * (inputs.ndim - 1))
-            shown = rendered.shown[render].astype(inputs.dtype)
-            inputs = jnp.where(spread, inputs, shown)
-            targets = jnp.where(of_case[:, None], targets, rendered.points[render])
+            # by rounding one may be drawn that has no share
+            rendering = (number >= cases) & within[render]
+            spread = rendering.reshape(-1, *(1,) * (inputs.ndim - 1))
+            inputs = jnp.where(spread, rendered.shown[render].astype(inputs.dtype), inputs)
+            targets = jnp.where(rendering[:, None], rendered.points[render], targets)
         return inputs, targets
 
 

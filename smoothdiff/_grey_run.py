@@ -101,10 +101,10 @@ class GreyRun:
 
     def _round(self) -> tuple[GreyState, GreyRecord]:
         key, state = jax.random.fold_in(self.key, self.rounds), self.state
-        solving, learning, moving = jax.random.split(key, 3)
+        solving, learning, drawing, moving = jax.random.split(key, 4)
         chosen = self.searches.chosen(state.rounds)
         said = self.lessons.answers(state.learner.mean, self.lessons.pictures[chosen])
-        points, before = self.searches.again(moving, state.known, state.rendered)
+        points, before = self.searches.again(drawing, state.known, state.rendered)
         moved = Moved.of(moving, points, self.lessons.answers(state.learner.mean, before))
         known, rendered, answered, after = self.searches.step(
             solving, said, chosen, state.known, state.rendered, moved.points

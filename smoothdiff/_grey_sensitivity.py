@@ -1,9 +1,9 @@
 """How much a picture changes with each parameter: what an error of the network costs.
 
-A network that is off by e in one parameter alone pays s e^2. Here s depends on the size of e: where
-edges move a picture changes by about |e|. So s is measured where it is needed. Some renders are
-made again with one parameter moved by as much as the network is usually off in it. The mean squared
-difference of the two pictures, over e^2, is s.
+A parameter that is off by e changes the picture by s e^2, mean squared. Here s depends on the size
+of e: where edges move a picture changes by about |e|. So s is measured where it is needed. Some
+renders are made again with one parameter moved by as much as the network is usually off in it. The
+mean squared difference of the two pictures, over e^2, is s.
 """
 
 from typing import NamedTuple
@@ -30,7 +30,7 @@ class Moved(NamedTuple):
 
     @staticmethod
     def of(key: Key[Array, ""], points: Float[Array, "k n"], said: Float[Array, "k n"]) -> "Moved":
-        """Of these, of whose renders the network says that; NaN where nothing is known."""
+        """Moves one entry of each point; `said` is the network's answer to its render, or NaN."""
         error = said - points
         usual = jnp.sqrt(jnp.nanmean(error**2, axis=0))
         k, n = points.shape
@@ -55,8 +55,8 @@ class Sensitivity(eqx.Module):
     @eqx.filter_jit
     def after(self, moved: Moved, change: Float[Array, " k"]) -> "Sensitivity":
         """With these, and the mean squared change of each picture, NaN where nothing is known."""
-        found = change / moved.distance**2
-        good = jnp.isfinite(found)
+        found = (change / moved.distance**2).astype(self.total.dtype)
+        good = jnp.isfinite(found) & jnp.isfinite(moved.distance)
         add = lambda x: jnp.zeros_like(self.total).at[moved.entry].add(jnp.where(good, x, 0))
         return Sensitivity(_MEMORY * self.total + add(found), _MEMORY * self.pairs + add(1.0))
 
