@@ -46,10 +46,8 @@ class Rendered(eqx.Module):
 
     def within(self, best: Float[Array, "cases n"]) -> Bool[Array, " kept"]:
         """Which did not fail, and have parameters within the range of the best ones."""
-        low, high = jnp.min(best, axis=0), jnp.max(best, axis=0)
-        inside = (self.points >= low[None]) & (self.points <= high[None])
         finite = jnp.isfinite(self.shown).all(axis=tuple(range(1, self.shown.ndim)))
-        return inside.all(axis=1) & finite
+        return inside(self.points, best) & finite
 
 
 class CaseSearches(eqx.Module):
@@ -214,6 +212,28 @@ class CaseSearches(eqx.Module):
         return at, state, points, seen, losses[1]
 
 
+def usual_range(best: Float[Array, "cases n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """The lowest and highest of each parameter, without a few that lie apart.
+
+    Those may look like a picture and yet be far from all others, as an angle a full turn away.
+    Among the outer twentieths the range ends where a gap is wider than a standard deviation.
+    """
+    outer, sorted_ = len(best) // 20, jnp.sort(best, axis=0)
+    gap = jnp.diff(sorted_, axis=0) > jnp.std(best, axis=0)[None]
+    # gaps from here outwards, in the order in which they come
+    below, above = gap[:outer][::-1], gap[len(gap) - outer :]
+    left = jnp.sum(jnp.cumsum(below, axis=0) == 0, axis=0)
+    right = jnp.sum(jnp.cumsum(above, axis=0) == 0, axis=0)
+    pick = lambda at: jnp.take_along_axis(sorted_, at[None], axis=0)[0]
+    return pick(outer - left), pick(len(gap) - outer + right)
+
+
+def inside(points: Float[Array, "k n"], best: Float[Array, "cases n"]) -> Bool[Array, " k"]:
+    """Which are within the usual range of the best ones."""
+    low, high = usual_range(best)
+    return ((points >= low[None]) & (points <= high[None])).all(axis=1)
+
+
 def like(
     key: Key[Array, ""], best: Float[Array, "cases n"], shape: tuple[int, int]
 ) -> Float[Array, "drawn fresh n"]:
@@ -225,7 +245,7 @@ def like(
     width = jnp.std(best, axis=0) * len(best) ** (-1 / (best.shape[1] + 4))
     points = best[jax.random.randint(which, shape, 0, len(best))]
     points += width[None, None] * jax.random.normal(where, points.shape, points.dtype)
-    low, high = jnp.min(best, axis=0), jnp.max(best, axis=0)
+    low, high = usual_range(best)
     return jnp.clip(points, low[None, None], high[None, None])
 
 

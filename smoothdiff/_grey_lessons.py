@@ -1,10 +1,10 @@
 """What a network learns, by AD and without a render: the answers that are known to be best.
 
 For a picture of a case that is the best that was found, for a render what was rendered. So it has
-as many pictures to learn from as there were renders, of which those within the range of what is
-known to be best count. All count alike: the cases, whose answers are not quite right, are soon few
-among the renders. The weights of late lessons are averaged (Shamir and Zhang, Stochastic gradient
-descent for non-smooth optimization, 2013).
+as many pictures to learn from as there were renders. All within the range of what is known to be
+best count alike: the cases, whose answers are not quite right, are soon few among the renders. The
+weights of late lessons are averaged (Shamir and Zhang, Stochastic gradient descent for non-smooth
+optimization, 2013).
 """
 
 from collections.abc import Callable
@@ -14,7 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+from jaxtyping import Array, Float, Int, Key, PyTree
 
 from smoothdiff._grey_cases import Known, Rendered
 from smoothdiff._solvers._base import promotion
@@ -70,14 +70,14 @@ class Lessons(eqx.Module):
         learner: Learner,
         best: Float[Array, "cases n"],
         rendered: Rendered,
-        within: Bool[Array, " kept"],
+        share: Float[Array, " cases+kept"],
         counts: Float[Array, " n"],
     ) -> tuple[Learner, Float[Array, ""]]:
         """One step of the optimiser on cases and renders that are drawn; and the misfit before.
 
-        An error in a parameter counts so many times.
+        Each is drawn in proportion to its share. Each parameter counts so many times.
         """
-        inputs, targets = self._drawn(key, best, rendered, within)
+        inputs, targets = self._drawn(key, best, rendered, share)
 
         def misfit(weights: PyTree) -> Array:
             each = optax.huber_loss(self.answers(weights, inputs), targets, delta=_DOUBT)
@@ -96,17 +96,17 @@ class Lessons(eqx.Module):
         return Learner(weights, mean, opt_state, learner.taught + 1), value
 
     def _drawn(
-        self, key: Array, best: Array, rendered: Rendered, within: Array
+        self, key: Array, best: Array, rendered: Rendered, share: Array
     ) -> tuple[Array, Array]:
-        """Pictures and answers: of cases, and of renders that are within the range."""
+        """Pictures and answers, of cases and renders."""
         cases, kept = len(self.pictures), len(rendered.points)
-        share = jnp.append(jnp.ones(cases, best.dtype), within.astype(best.dtype))
         number = jax.random.choice(key, cases + kept, (_PICTURES,), p=share / jnp.sum(share))
+        # by rounding one may be drawn that has no share
+        number = jnp.where(share[number] > 0, number, jnp.argmax(share))
         case, render = number % cases, number - cases
         inputs, targets = self.pictures[case], best[case]
         if kept:
-            # by rounding one may be drawn that has no share
-            rendering = (number >= cases) & within[render]
+            rendering = number >= cases
             spread = rendering.reshape(-1, *(1,) * (inputs.ndim - 1))
             inputs = jnp.where(spread, rendered.shown[render].astype(inputs.dtype), inputs)
             targets = jnp.where(rendering[:, None], rendered.points[render], targets)

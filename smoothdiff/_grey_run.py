@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Int, Key, PyTree
 
 from smoothdiff._checkpoint import Checkpoint
-from smoothdiff._grey_cases import CaseSearches, Known, Rendered
+from smoothdiff._grey_cases import CaseSearches, Known, Rendered, inside
 from smoothdiff._grey_lessons import Learner, Lessons, mean_loss
 from smoothdiff._grey_result import GreyRecord, GreyResult
 from smoothdiff._grey_sensitivity import Moved, Sensitivity
@@ -111,14 +111,13 @@ class GreyRun:
         )
         change = jnp.mean((after - before).reshape(len(after), -1) ** 2, axis=1)
         sensitivity = state.sensitivity.after(moved, change)
-        within, learner = rendered.within(known.best), state.learner
+        learner, best = state.learner, known.best
+        within = jnp.append(inside(best, best), rendered.within(best)).astype(best.dtype)
         counts, misfit = sensitivity.weights(), jnp.nan
         # one by one: to iterate over an array compiles a program of as many outputs, each round
         keys = jax.random.split(learning, self.each)
         for i in range(self.each):
-            learner, misfit = self.lessons.teach(
-                keys[i], learner, known.best, rendered, within, counts
-            )
+            learner, misfit = self.lessons.teach(keys[i], learner, best, rendered, within, counts)
         new = GreyState(state.rounds + 1, learner, known, rendered, sensitivity)
         record = GreyRecord(
             round=self.rounds + 1,

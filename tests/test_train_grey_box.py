@@ -11,7 +11,7 @@ import optax
 import pytest
 
 import smoothdiff as sd
-from smoothdiff._grey_cases import Rendered, like
+from smoothdiff._grey_cases import Rendered, like, usual_range
 from smoothdiff._grey_lessons import Lessons
 from smoothdiff._grey_sensitivity import Moved, Sensitivity
 
@@ -216,6 +216,22 @@ def test_the_last_renders_are_kept_and_those_within_the_range_count():
     np.testing.assert_array_equal(np.ravel(more.points), [2.0, 3.0, 4.0])
 
 
+@pytest.mark.parametrize("cases", [1, 2, 19, 40, 256])
+def test_the_range_leaves_out_a_few_that_lie_apart(cases):
+    bulk = np.linspace([-1.0, 5.0], [1.0, 6.0], cases)
+    low, high = jax.jit(usual_range)(jnp.asarray(bulk))
+    np.testing.assert_allclose([low, high], [bulk.min(0), bulk.max(0)])
+    # half of the pictures may be elsewhere
+    two = np.where(np.arange(cases)[:, None] % 2, bulk + 10, bulk)
+    np.testing.assert_allclose(usual_range(jnp.asarray(two))[1], two.max(0), rtol=1e-6)
+    apart = bulk.copy()
+    apart[: cases // 20, 0] += 7
+    apart[cases // 2 : cases // 2 + cases // 20, 1] -= 7
+    low, high = usual_range(jnp.asarray(apart))
+    assert high[0] == pytest.approx(bulk[:, 0].max())
+    assert low[1] == pytest.approx(bulk[:, 1].min())
+
+
 def test_one_parameter_is_moved_by_the_usual_error(key):
     points = jnp.arange(24.0).reshape(8, 3)
     error = np.random.default_rng(3).normal(size=(8, 3)) * [1.0, 2.0, 0.5]
@@ -230,13 +246,14 @@ def test_one_parameter_is_moved_by_the_usual_error(key):
 
 
 def test_what_failed_is_no_lesson(key):
-    """Also where rounding draws a render that has no share, as here all have none."""
+    """Nor what lies outside the range, which has no share either."""
     pictures, best = jnp.arange(12.0).reshape(3, 2, 2), jnp.arange(3.0)[:, None]
     lessons = Lessons(lambda weights, picture: picture[0], pictures, ADAM)
     nothing = Rendered(jnp.full((5, 1), jnp.nan), jnp.full((5, 2, 2), jnp.nan))
-    inputs, targets = lessons._drawn(key, best, nothing, jnp.zeros(5, bool))
+    share = jnp.array([1.0, 0, 1, *[0] * 5])
+    inputs, targets = lessons._drawn(key, best, nothing, share)
     case = np.asarray(targets[:, 0], int)
-    assert set(case) == {0, 1, 2}
+    assert set(case) == {0, 2}
     np.testing.assert_array_equal(inputs, pictures[case])
 
 
