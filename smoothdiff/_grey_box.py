@@ -47,7 +47,7 @@ def train_grey_box(
 
     $$ \min_\phi \frac1C \sum_c \| R(g_\phi(I_c)) - I_c \|^2, \qquad
        x_c \approx \arg\min_x \| R(x) - I_c \|^2, \qquad
-       \phi \approx \arg\min_\phi \sum_{ij} s_j h(g_\phi(R(x_i))_j - x_{ij}) $$
+       \phi \approx \arg\min_\phi \sum_{ij} w_j h(g_\phi(R(x_i))_j - x_{ij}) $$
 
     A case is a picture I. AD can differentiate the network g, and not the renderer R. So the
     problem is split in two:
@@ -57,14 +57,14 @@ def train_grey_box(
       stays in a wrong valley. Where the network's answer is nearer, the search goes on from there.
     - **Lessons.** The network learns by AD, without a render, to answer the best parameters that
       are known. A render is a picture whose parameters are known, so it learns from renders too:
-      from all whose parameters are within the range of the best ones. h is Huber's loss, and
-      s_j is how much a picture changes with parameter j, one in the mean.
+      from all whose parameters are within the range of the best ones. h is Huber's loss.
+      The weight w_j is the root of how much a picture changes with parameter j, one in the mean.
 
     The renders of the searches soon look like the pictures themselves. So half of all renders are
     of new parameters, drawn from a kernel density estimate of the best ones. The network then sees
     as many different pictures as there are renders, and does better on pictures that it has not
     seen. At most one in eight of these are earlier ones with one parameter moved by as much as the
-    network is usually off in it: s is measured with them. In each round some cases take a step, and
+    network is usually off in it: w is measured with them. In each round some cases take a step, and
     then the network gets its lessons.
 
     Args:
@@ -88,7 +88,7 @@ def train_grey_box(
             parameters, and a case learns from its own renders alone. That is for pictures which no
             render looks like.
         new_parameters: whether half of all renders are of new parameters. These renders teach the
-            network alone; the searches gain nothing from them. Without them all s are one.
+            network alone; the searches gain nothing from them. Without them all w_j are one.
         target: a loss that is good enough: the mean over the cases of a round, of the network's
             answers.
         max_seconds: seconds after which no further round begins.

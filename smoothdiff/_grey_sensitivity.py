@@ -4,6 +4,10 @@ A parameter that is off by e changes the picture by s e^2, mean squared. Here s 
 of e: where edges move a picture changes by about |e|. So s is measured where it is needed. Some
 renders are made again with one parameter moved by as much as the network is usually off in it. The
 mean squared difference of the two pictures, over e^2, is s.
+
+A parameter counts as the root of its s, halfway between what pictures and what parameters say.
+Where all count alike a network learns much that cannot be seen; where they count as s it neglects
+those that are hard to learn and hardly seen, and is far off in them.
 """
 
 from typing import NamedTuple
@@ -17,7 +21,7 @@ from jaxtyping import Array, Float, Int, Key
 _MEMORY = 0.8
 # so many pairs say that a parameter is like the others
 _ALIKE = 2
-# no parameter counts less than this share of the mean
+# no parameter is less sensitive than this share of the mean
 _LEAST = 0.01
 
 
@@ -66,5 +70,5 @@ class Sensitivity(eqx.Module):
         usual = jnp.sum(self.total) / jnp.maximum(jnp.sum(self.pairs), 1)
         usual = jnp.where(usual > 0, usual, 1)
         found = (self.total + _ALIKE * usual) / (self.pairs + _ALIKE)
-        found = jnp.maximum(found / jnp.mean(found), _LEAST)
+        found = jnp.sqrt(jnp.maximum(found / jnp.mean(found), _LEAST))
         return found / jnp.mean(found)
