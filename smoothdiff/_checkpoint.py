@@ -33,7 +33,7 @@ class Checkpoint:
         """What was saved, with the structure and dtypes of `like`; None if there is no file.
 
         Raises:
-            ValueError: the file is no checkpoint, or one of another problem.
+            ValueError: the file is no checkpoint, or one of another problem or version.
         """
         if not self._path.exists():
             return None
@@ -50,7 +50,10 @@ class Checkpoint:
         self._identity.parts = kept
         leaves, treedef = jax.tree.flatten(like)
         if len(arrays) != len(leaves):
-            raise self.other("its state is that of another version")
+            raise ValueError(
+                f"the checkpoint {self._path} was written by another version. Name another file, "
+                "or delete this one"
+            )
         return treedef.unflatten(map(_restore, arrays, leaves))
 
     def other(self, how: str) -> ValueError:

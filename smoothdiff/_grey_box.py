@@ -57,15 +57,16 @@ def train_grey_box(
       stays in a wrong valley. Where the network's answer is nearer, the search goes on from there.
     - **Lessons.** The network learns by AD, without a render, to answer the best parameters that
       are known. A render is a picture whose parameters are known, so it learns from renders too:
-      from all whose parameters are within the range of the best ones. h is Huber's loss.
-      The weight w_j is the root of how much a picture changes with parameter j, one in the mean.
+      from all whose parameters are within the range of the best ones. A few best ones that lie
+      apart do not count, neither for the range nor as lessons. h is Huber's loss. The weight w_j is
+      the root of how much a picture changes with parameter j, one in the mean.
 
     The renders of the searches soon look like the pictures themselves. So half of all renders are
     of new parameters, drawn from a kernel density estimate of the best ones. The network then sees
     as many different pictures as there are renders, and does better on pictures that it has not
-    seen. At most one in eight of these are earlier ones with one parameter moved by as much as the
-    network is usually off in it: w is measured with them. In each round some cases take a step, and
-    then the network gets its lessons.
+    seen. At most one in eight of the new parameters are earlier ones with one entry moved by as
+    much as the network is usually off in it: w is measured with them. In each round some cases take
+    a step, and then the network gets its lessons.
 
     Args:
         model: the network: `model(picture)` gives the parameters of the renderer, an array or a
@@ -79,7 +80,7 @@ def train_grey_box(
         key: a random key; the same key gives the same training.
         sigma: how far from an answer to look, in the units of the parameters: a number or a pytree
             like them.
-        max_evaluations: the most renders, never exceeded. Adam's rate falls until then.
+        max_evaluations: the most renders, never exceeded.
         optim: an optax transformation. By default Adam, whose rate falls from 3e-3 to 6e-5 over the
             lessons.
         lessons: updates of the network in a round, each on 64 pictures.

@@ -123,7 +123,7 @@ class CaseSearches(eqx.Module):
         """Steps of some cases, of which the network has said this; and the losses of that.
 
         The first new parameters of each case are replaced by `moved`, unless that is NaN. Returned
-        last: the renders of these.
+        last: the renders of these, where there are any.
         """
         draw, *keys = jax.random.split(key, self.drawn + 1)
         # at first nothing is known, and these are all but what the untrained network says
@@ -155,10 +155,10 @@ class CaseSearches(eqx.Module):
         )
 
     @eqx.filter_jit
-    def again(
+    def earlier(
         self, key: Key[Array, ""], known: Known, rendered: Rendered
     ) -> tuple[Float[Array, "drawn n"], Float[Array, "drawn ..."]]:
-        """Some renders within the range of what is known, to be made again; NaN without any."""
+        """Some earlier renders in the range, to be made again with one parameter moved; or NaN."""
         if not self.moves:
             some = (known.best[: self.drawn], self.pictures[: self.drawn])
             return jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.nan), some)
@@ -218,20 +218,31 @@ def usual_range(best: Float[Array, "cases n"]) -> tuple[Float[Array, " n"], Floa
     Those may look like a picture and yet be far from all others, as an angle a full turn away.
     Among the outer twentieths the range ends where a gap is wider than a standard deviation.
     """
-    outer, sorted_ = len(best) // 20, jnp.sort(best, axis=0)
-    gap = jnp.diff(sorted_, axis=0) > jnp.std(best, axis=0)[None]
-    # gaps from here outwards, in the order in which they come
-    below, above = gap[:outer][::-1], gap[len(gap) - outer :]
-    left = jnp.sum(jnp.cumsum(below, axis=0) == 0, axis=0)
-    right = jnp.sum(jnp.cumsum(above, axis=0) == 0, axis=0)
-    pick = lambda at: jnp.take_along_axis(sorted_, at[None], axis=0)[0]
-    return pick(outer - left), pick(len(gap) - outer + right)
+    return _lowest(best), -_lowest(-best)
+
+
+def _lowest(best: Float[Array, "cases n"]) -> Float[Array, " n"]:
+    """Above the last wide gap of the lowest twentieth."""
+    outer, ordered = len(best) // 20, jnp.sort(best, axis=0)
+    below, above = ordered[:outer], ordered[1 : outer + 1]
+    wide = above - below > jnp.std(best, axis=0)[None]
+    return jnp.max(jnp.append(ordered[:1], jnp.where(wide, above, ordered[:1]), axis=0), axis=0)
 
 
 def inside(points: Float[Array, "k n"], best: Float[Array, "cases n"]) -> Bool[Array, " k"]:
     """Which are within the usual range of the best ones."""
     low, high = usual_range(best)
     return ((points >= low[None]) & (points <= high[None])).all(axis=1)
+
+
+def lessons_among(known: Known, rendered: Rendered) -> Bool[Array, " cases+kept"]:
+    """Which cases and which renders a network may learn from: those in the usual range.
+
+    Without renders to share most cases have had no turn for long, and there is no range yet.
+    """
+    if not len(rendered.points):
+        return jnp.ones(len(known.best), bool)
+    return jnp.append(inside(known.best, known.best), rendered.within(known.best))
 
 
 def like(

@@ -70,14 +70,14 @@ class Lessons(eqx.Module):
         learner: Learner,
         best: Float[Array, "cases n"],
         rendered: Rendered,
-        share: Float[Array, " cases+kept"],
+        shares: Float[Array, " cases+kept"],
         counts: Float[Array, " n"],
     ) -> tuple[Learner, Float[Array, ""]]:
         """One step of the optimiser on cases and renders that are drawn; and the misfit before.
 
         Each is drawn in proportion to its share. Each parameter counts so many times.
         """
-        inputs, targets = self._drawn(key, best, rendered, share)
+        inputs, targets = self._drawn(key, best, rendered, shares)
 
         def misfit(weights: PyTree) -> Array:
             each = optax.huber_loss(self.answers(weights, inputs), targets, delta=_DOUBT)
@@ -96,14 +96,14 @@ class Lessons(eqx.Module):
         return Learner(weights, mean, opt_state, learner.taught + 1), value
 
     def _drawn(
-        self, key: Array, best: Array, rendered: Rendered, share: Array
+        self, key: Array, best: Array, rendered: Rendered, shares: Array
     ) -> tuple[Array, Array]:
-        """Pictures and answers, of cases and renders."""
+        """Pictures and answers, of cases and renders, in proportion to their shares."""
         cases, kept = len(self.pictures), len(rendered.points)
-        number = jax.random.choice(key, cases + kept, (_PICTURES,), p=share / jnp.sum(share))
+        number = jax.random.choice(key, cases + kept, (_PICTURES,), p=shares / jnp.sum(shares))
         # by rounding one may be drawn that has no share
-        number = jnp.where(share[number] > 0, number, jnp.argmax(share))
-        case, render = number % cases, number - cases
+        number = jnp.where(shares[number] > 0, number, jnp.argmax(shares))
+        case, render = number % cases, jnp.maximum(number - cases, 0)
         inputs, targets = self.pictures[case], best[case]
         if kept:
             rendering = number >= cases

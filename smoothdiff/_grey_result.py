@@ -18,7 +18,7 @@ class GreyRecord(NamedTuple):
             round's lessons.
         known: the lowest loss of any render, averaged over all cases.
         misfit: what the network learns to make small, in the last lesson: Huber's loss of its
-            answers, each parameter weighted by how much a picture changes with it.
+            answers, each parameter weighted by the root of how much a picture changes with it.
         model: the network after the round, with averaged weights; None in the history.
 
     Example:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Int, Key, PyTree
 
 from smoothdiff._checkpoint import Checkpoint
-from smoothdiff._grey_cases import CaseSearches, Known, Rendered, inside
+from smoothdiff._grey_cases import CaseSearches, Known, Rendered, lessons_among
 from smoothdiff._grey_lessons import Learner, Lessons, mean_loss
 from smoothdiff._grey_result import GreyRecord, GreyResult
 from smoothdiff._grey_sensitivity import Moved, Sensitivity
@@ -104,7 +104,7 @@ class GreyRun:
         solving, learning, drawing, moving = jax.random.split(key, 4)
         chosen = self.searches.chosen(state.rounds)
         said = self.lessons.answers(state.learner.mean, self.lessons.pictures[chosen])
-        points, before = self.searches.again(drawing, state.known, state.rendered)
+        points, before = self.searches.earlier(drawing, state.known, state.rendered)
         moved = Moved.of(moving, points, self.lessons.answers(state.learner.mean, before))
         known, rendered, answered, after = self.searches.step(
             solving, said, chosen, state.known, state.rendered, moved.points
@@ -112,12 +112,12 @@ class GreyRun:
         change = jnp.mean((after - before).reshape(len(after), -1) ** 2, axis=1)
         sensitivity = state.sensitivity.after(moved, change)
         learner, best = state.learner, known.best
-        within = jnp.append(inside(best, best), rendered.within(best)).astype(best.dtype)
-        counts, misfit = sensitivity.weights(), jnp.nan
+        shares = lessons_among(known, rendered).astype(best.dtype)
+        counts, misfit = sensitivity.counts(), jnp.nan
         # one by one: to iterate over an array compiles a program of as many outputs, each round
         keys = jax.random.split(learning, self.each)
         for i in range(self.each):
-            learner, misfit = self.lessons.teach(keys[i], learner, best, rendered, within, counts)
+            learner, misfit = self.lessons.teach(keys[i], learner, best, rendered, shares, counts)
         new = GreyState(state.rounds + 1, learner, known, rendered, sensitivity)
         record = GreyRecord(
             round=self.rounds + 1,

@@ -65,9 +65,10 @@ class Sensitivity(eqx.Module):
         return Sensitivity(_MEMORY * self.total + add(found), _MEMORY * self.pairs + add(1.0))
 
     @eqx.filter_jit
-    def weights(self) -> Float[Array, " n"]:
-        """What each parameter counts, one in the mean; all the same while nothing is known."""
-        usual = jnp.sum(self.total) / jnp.maximum(jnp.sum(self.pairs), 1)
+    def counts(self) -> Float[Array, " n"]:
+        """What each parameter counts: the root, one in the mean; one while nothing is known."""
+        pairs = jnp.sum(self.pairs)
+        usual = jnp.sum(self.total) / jnp.where(pairs > 0, pairs, 1)
         usual = jnp.where(usual > 0, usual, 1)
         found = (self.total + _ALIKE * usual) / (self.pairs + _ALIKE)
         found = jnp.sqrt(jnp.maximum(found / jnp.mean(found), _LEAST))

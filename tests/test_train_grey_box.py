@@ -11,7 +11,7 @@ import optax
 import pytest
 
 import smoothdiff as sd
-from smoothdiff._grey_cases import Rendered, like, usual_range
+from smoothdiff._grey_cases import Known, Rendered, lessons_among, like, usual_range
 from smoothdiff._grey_lessons import Lessons
 from smoothdiff._grey_sensitivity import Moved, Sensitivity
 
@@ -153,7 +153,7 @@ def test_a_training_that_was_killed_is_taken_up(tmp_path):
         parts = dict(file)
     del parts[max(parts, key=lambda name: name.isdigit() and int(name))]
     np.savez(path, **parts)
-    with pytest.raises(ValueError, match="state is that of another version"):
+    with pytest.raises(ValueError, match="written by another version"):
         train(checkpoint=path)
 
 
@@ -232,6 +232,17 @@ def test_the_range_leaves_out_a_few_that_lie_apart(cases):
     assert low[1] == pytest.approx(bulk[:, 1].min())
 
 
+def test_without_renders_all_cases_teach():
+    """Where one had a turn it is far from the others, which are as the untrained network is."""
+    best = jnp.zeros((40, 2)).at[0].set(5.0)
+    known = Known(best, jnp.full(40, jnp.inf).at[0].set(1.0), best, None)
+    nothing = Rendered(jnp.zeros((0, 2)), jnp.zeros((0, 3)))
+    assert np.all(lessons_among(known, nothing))
+    some = Rendered(jnp.array([[0.0, 0.0], [5.0, 5.0]]), jnp.zeros((2, 3)))
+    found = lessons_among(known, some)
+    np.testing.assert_array_equal(found, [False, *[True] * 39, True, False])
+
+
 def test_one_parameter_is_moved_by_the_usual_error(key):
     points = jnp.arange(24.0).reshape(8, 3)
     error = np.random.default_rng(3).normal(size=(8, 3)) * [1.0, 2.0, 0.5]
@@ -283,16 +294,16 @@ def test_pictures_in_float32_of_a_renderer_in_float64(x64):
     assert np.all(np.asarray(result.state.sensitivity.pairs) > 0)
 
 
-def test_errors_count_as_much_as_pictures_change(dtype):
+def test_parameters_count_as_the_root_of_what_pictures_change(dtype):
     """Of a picture that is 10 x and y and an edge at z, by hand; failed and unknown ones do not."""
     sensitivity = Sensitivity.start(jnp.zeros(3, dtype))
-    np.testing.assert_array_equal(sensitivity.weights(), [1, 1, 1])
+    np.testing.assert_array_equal(sensitivity.counts(), [1, 1, 1])
     edge = 0.01  # it moves by that, and so many pixels change by one
     moved = Moved(jnp.zeros((6, 3)), jnp.arange(6) % 3, jnp.array([0.1, 0.2, edge] * 2, dtype))
     change = jnp.array([(10 * 0.1) ** 2, 0.2**2, edge] * 2, dtype)
     for _ in range(40):
         sensitivity = sensitivity.after(moved, change)
-    weights = np.asarray(sensitivity.weights())
+    weights = np.asarray(sensitivity.counts())
     assert weights.dtype == dtype
     assert np.mean(weights) == pytest.approx(1)
     # the root of what is shrunk towards each other, by two pairs to ten
@@ -305,7 +316,7 @@ def test_errors_count_as_much_as_pictures_change(dtype):
     # what a parameter counts has a lower limit
     sensitivity = Sensitivity(jnp.array([1e4, 0.0]), jnp.array([1e4, 1e4]))
     root = np.sqrt([2, 0.01])
-    np.testing.assert_allclose(sensitivity.weights(), root / np.mean(root), rtol=1e-3)
+    np.testing.assert_allclose(sensitivity.counts(), root / np.mean(root), rtol=1e-3)
 
 
 @pytest.mark.slow
@@ -314,7 +325,7 @@ def test_a_training_finds_how_much_pictures_change():
     result = train(lambda at: render({"x": scale[0] * at["x"], "y": scale[1] * at["y"]}))
     # of four pixels, each parameter alone
     expected = scale**2 * np.mean(DRAWING**2, axis=0)
-    weights = result.state.sensitivity.weights()
+    weights = result.state.sensitivity.counts()
     pairs = np.asarray(result.state.sensitivity.pairs)
     expected = (pairs * expected + 2 * np.average(expected, weights=pairs)) / (pairs + 2)
     expected = np.sqrt(expected)

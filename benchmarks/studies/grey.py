@@ -3,10 +3,10 @@
 The parts are added one after the other. The gradient is that of the loss of each case, by
 `smooth_grad`, pulled back through the network. With Gauss-Newton case by case the network learns
 what each case found by its own renders; with shared lessons all cases and the network learn from
-all renders; and with new poses half of the renders are of poses that are like those found, and an
-error in a parameter counts as much as it changes pictures. Poses of pictures, weights and random
-numbers have other seeds than the tasks `cnn` and `cnn5`, and networks are judged on four times as
-many pictures.
+all renders; and with new poses half of the renders are of poses that are like those found, and
+parameters count as the root of how much pictures change with them. Poses of pictures, weights and
+random numbers have other seeds than the tasks `cnn` and `cnn5`, and networks are judged on four
+times as many pictures.
 """
 
 import dataclasses
@@ -35,7 +35,7 @@ PARTS = {
     "gradient": "gradient of each case",
     "cases": "Gauss-Newton case by case",
     "shared": "... and shared lessons",
-    "whole": "... and new poses, by which errors count",
+    "whole": "... and new poses, and weights",
 }
 SETTINGS = {"cases": {"kept": 0}, "shared": {"new_parameters": False}, "whole": {}}
 
