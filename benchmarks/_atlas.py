@@ -6,6 +6,7 @@ picked by hand.
 
 import base64
 import io
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -18,6 +19,7 @@ from benchmarks._loop import Run, within
 from benchmarks._task import Method, Task
 
 LARGEST = 128  # pixels along the longer side
+STRIP = 4  # a picture so many times as wide as high has square views side by side
 MARKS = (10, 20, 40)  # evaluations at which a film has pictures
 # the methods in it: what users have, and ours
 FILMED = ("fr22", "nelder_mead", "cma_es", "py_bobyqa", "newton_cg", "gauss_newton")
@@ -74,7 +76,8 @@ def stored(task: dict[str, Any], names: list[str]) -> Pictures | None:
     """The pictures of a task's results, whose methods are `names`; None where there are none."""
     if not task.get("pictures"):
         return None
-    start, *found, reference = np.split(_read(task["pictures"]), len(names) + 2)
+    shown = np.split(_read(task["pictures"]), len(names) + 2)
+    start, *found, reference = map(_folded, shown)  # those of older results are strips
     return Pictures(start, dict(zip(names, found, strict=True)), reference)
 
 
@@ -116,7 +119,20 @@ def _image(picture: np.ndarray) -> Image.Image:
     return Image.fromarray(np.rint(255 * picture).astype(np.uint8))
 
 
+def _folded(picture: np.ndarray) -> np.ndarray:
+    """Views side by side, as a block about as wide as high; other pictures as they are."""
+    count = round(picture.shape[1] / picture.shape[0])
+    if count < STRIP:
+        return picture
+    across = math.ceil(math.sqrt(count))
+    width = picture.shape[1] // count
+    views = [view[:, :width] for view in np.array_split(picture, count, axis=1)]
+    views += [np.zeros_like(views[0])] * (-count % across)
+    lines = [views[first : first + across] for first in range(0, len(views), across)]
+    return np.concatenate([np.concatenate(line, axis=1) for line in lines])
+
+
 def _small(picture: np.ndarray) -> np.ndarray:
-    image = _image(picture)
+    image = _image(_folded(picture))
     image.thumbnail((LARGEST, LARGEST), Image.Resampling.LANCZOS)  # no larger than it was
     return np.asarray(image) / 255

@@ -289,6 +289,20 @@ def test_pictures_are_those_of_the_first_start():
     assert _atlas.stored(of_scene({"fr22": 2}), ["fr22"]) is None
 
 
+def test_views_side_by_side_are_shown_as_a_block():
+    views = [np.full((4, 4, 3), shade) for shade in (0.0, 0.2, 0.4, 0.6, 0.8)]
+    strip = np.concatenate(views, axis=1)
+    shown = _atlas.stored({"pictures": _atlas.png(np.concatenate([strip, 1 - strip]))}, [])
+    assert shown is not None
+    rows = [np.concatenate(views[:3], axis=1), np.concatenate([*views[3:], views[0]], axis=1)]
+    assert shown.start == pytest.approx(np.concatenate(rows))
+    # what is wide, but no strip, stays
+    wide = np.concatenate(views[:3], axis=1)
+    shown = _atlas.stored({"pictures": _atlas.png(np.concatenate([wide, wide]))}, [])
+    assert shown is not None
+    assert shown.reference == pytest.approx(wide)
+
+
 def test_a_film_has_what_was_found_within_so_many_evaluations(tmp_path):
     at = {f"found {mark}": np.asarray(REFERENCE) * mark / 40 for mark in _atlas.MARKS}
     method = lambda name: Method(name, name, lambda problem: None, "")  # type: ignore[arg-type]
