@@ -95,7 +95,7 @@ def studies() -> dict[str, ModuleType]:
 
 def _named(found: dict, name: str, what: str):
     if name not in found:
-        raise ValueError(f"There is no {what} {name!r}; choose from {', '.join(found)}.")
+        raise SystemExit(f"There is no {what} {name!r}; choose from {', '.join(found)}.")
     return found[name]
 
 
