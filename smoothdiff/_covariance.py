@@ -135,10 +135,10 @@ def _regression(
 
 
 def covariance(
-    known: Slopes | None, residuals: int, squares: float, held: Bool[np.ndarray, " n"]
+    known: Slopes | None, residuals: int, squares: float, fixed: Bool[np.ndarray, " n"]
 ) -> Covariance:
-    """Of the parameters that are not held, for so many residuals and the sum of their squares."""
-    n, free = len(held), np.flatnonzero(~held)
+    """Of the parameters that are not fixed, for so many residuals and the sum of their squares."""
+    n, free = len(fixed), np.flatnonzero(~fixed)
     matrix, freedom = np.full((n, n), np.nan), residuals - len(free)
     if known is None or freedom < 1 or not len(free):
         return Covariance(matrix, freedom)

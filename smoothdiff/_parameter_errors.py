@@ -69,25 +69,24 @@ class ParameterErrors:
         Warns of what is not known, and why.
         """
         here, low, high = answer.vector(), *answer.sides()
-        held, names = (here <= low) | (here >= high), np.asarray(answer.units.labels())
+        fixed, names = (here <= low) | (here >= high), np.asarray(answer.units.labels())
         residuals = history.rows.shape[1]
-        unit = covariance(slopes(*answer.evaluations(history)), residuals, 2 * fun, held)
-        unknown = ~held & np.isnan(np.diag(unit.matrix))
+        unit = covariance(slopes(*answer.evaluations(history)), residuals, 2 * fun, fixed)
+        unknown = ~fixed & np.isnan(np.diag(unit.matrix))
         said = []
-        if np.any(held):
-            said.append(
-                f"no error of {_listed(names[held])}, at a bound; the others are for it fixed there"
-            )
+        if np.any(fixed):
+            which = _listed(names[fixed])
+            said.append(f"no error of {which}, at a bound; the others are for it fixed there")
         if unit.freedom < 1:
             said.append(
-                f"no errors from {residuals} residuals of {np.sum(~held)} parameters: there must "
+                f"no errors from {residuals} residuals of {np.sum(~fixed)} parameters: there must "
                 "be more residuals than parameters"
             )
         elif np.any(unknown):
             said.append(
                 f"no error of {_listed(names[unknown])}: the evaluations do not tell how the "
                 "residuals depend on them. "
-                + _why(bool(answer.more), 2 * int(np.sum(~held)), takes_key)
+                + _why(bool(answer.more), 2 * int(np.sum(~fixed)), takes_key)
             )
         if said:
             warnings.warn("; ".join(said), stacklevel=5)

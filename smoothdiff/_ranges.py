@@ -107,10 +107,10 @@ class Range(AbstractSpace):
         dtype = floating(np.zeros(0, dtype)).dtype
         low, high = self._held(dtype)
         with np.errstate(over="ignore"):
-            held = (low < high) & np.isfinite(high - low)
+            usable = (low < high) & np.isfinite(high - low)
         if self.log:
-            held &= low >= jnp.finfo(dtype).tiny
-        if not np.all(held):
+            usable &= low >= jnp.finfo(dtype).tiny
+        if not np.all(usable):
             raise ValueError(
                 f"the range [{self.low}, {self.high}] of the parameter{name} is too narrow or too "
                 f"wide for {dtype}: pass the parameter in float64, or in other units"

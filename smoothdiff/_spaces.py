@@ -131,8 +131,8 @@ class AbstractSpace(abc.ABC):
     def _check_held(self, field: str, dtype: np.dtype, name: str) -> None:
         value, dtype = getattr(self, field), floating(np.zeros(0, dtype)).dtype
         with np.errstate(over="ignore", under="ignore"):
-            held = np.asarray(value).astype(dtype)
-        if not np.all(np.isfinite(held) & (held >= jnp.finfo(dtype).tiny)):
+            stored = np.asarray(value).astype(dtype)
+        if not np.all(np.isfinite(stored) & (stored >= jnp.finfo(dtype).tiny)):
             raise ValueError(
                 f"{field} = {value} of the parameter{name} is beyond {dtype}: pass the parameter "
                 "in float64, or in other units"

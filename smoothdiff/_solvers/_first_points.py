@@ -68,7 +68,7 @@ class FirstPoints(eqx.Module):
         """Whether no point is left."""
         return jnp.all(self.left == 0)
 
-    def told(self) -> Bool[Array, " n"]:
+    def determined(self) -> Bool[Array, " n"]:
         """Parameters of which no point is left."""
         return self._all_have(0)
 

@@ -82,8 +82,8 @@ def local_steps(
     slopes = _slopes(of_all(points), of_all(residuals), jnp.sum(valid))
     if low is not None and high is not None:
         gradient = dot(slopes, here)
-        held = ((low >= 0) & (gradient > 0)) | ((high <= 0) & (gradient < 0))
-        slopes = jnp.where(held[:, None], 0, slopes)
+        active = ((low >= 0) & (gradient > 0)) | ((high <= 0) & (gradient < 0))
+        slopes = jnp.where(active[:, None], 0, slopes)
     return _damped(slopes, here)
 
 

@@ -41,7 +41,7 @@ def gauss_newton_step(
 
     A parameter at a bound stays there if the sum of squares falls outwards. One that the step would
     take across a bound is put there. The step of the others is computed from residuals as they
-    would be with those held.
+    would be with those fixed.
     """
     # far from the iterate the linear model is off by about the square of the distance
     distance = jnp.mean(u**2, axis=1) / _REACH**2
@@ -57,20 +57,20 @@ def gauss_newton_step(
     active = ((low >= 0) & (slope > 0)) | ((high <= 0) & (slope < 0))
 
     def regress(carry: tuple) -> tuple:
-        held: Array
-        held, _, active, _, times = carry
-        moved = _move(gram, u, weight, held, active)
+        clipped: Array
+        clipped, _, active, _, times = carry
+        moved = _move(gram, u, weight, clipped, active)
         step, stderr = _regress(moved, jnp.where(active[None], 0, u), weight)
-        step = jnp.where(active, held, step)
-        held = jnp.clip(step, low, high)
-        crossed = held != step
-        return held, stderr, active | crossed, jnp.any(crossed), times + 1
+        step = jnp.where(active, clipped, step)
+        clipped = jnp.clip(step, low, high)
+        crossed = clipped != step
+        return clipped, stderr, active | crossed, jnp.any(crossed), times + 1
 
     # once more only where the step would cross a bound
     none = jnp.zeros_like(low)
     again = lambda carry: carry[3] & (carry[4] < _TIMES)
-    held, stderr, *_ = jax.lax.while_loop(again, regress, (none, none, active, True, 0))
-    return held, stderr
+    clipped, stderr, *_ = jax.lax.while_loop(again, regress, (none, none, active, True, 0))
+    return clipped, stderr
 
 
 def _regress(gram: Array, u: Array, weight: Array) -> tuple[Array, Array]:
@@ -158,11 +158,11 @@ def _gradient(gram: Array, u: Array, weight: Array) -> Array:
     return dot(inverse * dot(left.T, along), right)
 
 
-def _move(gram: Array, u: Array, weight: Array, held: Array, active: Array) -> Array:
-    """The Gram matrix of the residuals as they would be with the active parameters held."""
+def _move(gram: Array, u: Array, weight: Array, clipped: Array, active: Array) -> Array:
+    """The Gram matrix of the residuals as they would be with the active parameters fixed."""
     root, total = jnp.sqrt(weight), jnp.sum(weight)
     centred = (u - (dot(weight, u) / total)[None]) * root[:, None]
-    away = jnp.where(active[None], u - held[None], 0) * root[:, None]
+    away = jnp.where(active[None], u - clipped[None], 0) * root[:, None]
     left, inverse, right = _svd(centred)
     # the linear fit's change of each row, then each row from the new mean
     moved = _eye(gram[1:, 1:]) - dot(dot(away, right.T) * inverse[None], left.T)

@@ -255,7 +255,7 @@ class QuadraticTrust(eqx.Module):
             lambda v: dot(hessian, v), jnp.diagonal(hessian), jnp.zeros_like(fun)
         )
         outcome = ratio_test(before, fun, reduction, self.fails)
-        _, failed, held, long, fails, _ = outcome
+        _, failed, very_successful, long, fails, _ = outcome
         hit = jnp.where(failed, -1, outcome.tried.astype(fails.dtype))
         # a check is no step, but a model that is right about it may have converged
         right = proposal.check & is_right(before, funs[0], proposal.rise)
@@ -274,7 +274,7 @@ class QuadraticTrust(eqx.Module):
         # near a minimum rounding may explain a failure, and a check needs the radius to tell
         explained = self.settled & ~(promise > FEW[fun.dtype.name] * unit)
         radius = jnp.where(failed & ~wait & ~explained, lower, self.radius)
-        radius = jnp.where(held, jnp.maximum(radius, 2 * length), radius)
+        radius = jnp.where(very_successful, jnp.maximum(radius, 2 * length), radius)
         # where a check rose by more than rounding, the radius is not too small to tell
         tells = funs[0] - before > TELLING * unit
         tight = proposal.tight & ~self.teaches() & ~(proposal.check & tells)

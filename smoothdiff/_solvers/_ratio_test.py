@@ -5,8 +5,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-# a step fails at this acceptance ratio; above the other one the radius may grow
-LEAST, _HELD = 0.1, 0.7
+# a step fails at this acceptance ratio, and is very successful above the other one
+LEAST, _VERY = 0.1, 0.7
 # a step that raises the function by so many times the predicted reduction was far too long
 _FAR_OFF = 10.0
 # a step of this share of the radius would have been longer without it
@@ -27,14 +27,15 @@ _NARROW = 1e-3
 class Outcome(NamedTuple):
     """What came of a step; all are false where none was `tried`, as for a point of geometry.
 
-    A step that `failed` may have been `long`: far too long. Then the scale is wrong, which says
-    nothing against the model. `fails` counts the other failures in a row. The model promised `more`
-    than rounding may take.
+    After a `very_successful` step, whose reduction came true, the radius may grow. One that
+    `failed` may have been `long`: far too long. Then the scale is wrong, which says nothing against
+    the model. `fails` counts the other failures in a row. The model promised `more` than rounding
+    may take.
     """
 
     tried: Bool[Array, ""]
     failed: Bool[Array, ""]
-    held: Bool[Array, ""]
+    very_successful: Bool[Array, ""]
     long: Bool[Array, ""]
     fails: Int[Array, ""]
     more: Bool[Array, ""]
@@ -75,7 +76,7 @@ def ratio_test(
     long = failed & jnp.isfinite(ratio) & (ratio < -_FAR_OFF)
     count = jnp.where(failed & ~long, fails + 1, jnp.where(tried & ~failed, 0, fails))
     more = reduction > taken_by_rounding(before)
-    return Outcome(tried, failed, tried & (ratio > _HELD), long, count, more)
+    return Outcome(tried, failed, tried & (ratio > _VERY), long, count, more)
 
 
 def taken_by_rounding(fun: Float[Array, ""]) -> Float[Array, ""]:

@@ -81,7 +81,7 @@ class TrustRegion(eqx.Module):
     and `slow` counts the evaluations in a row that lowered the loss by little or nothing, while the
     radius did not grow. The next point may be a `check`. The last step may be `settled`, see there,
     or `level`: it promised no more than rounding, and came to that; and the model may be `right`
-    about a check. `foreseen` is the length of the longest step that held and was foreseen.
+    about a check. `foreseen` is the length of the longest very successful step that was foreseen.
     """
 
     radius: Float[Array, ""]
@@ -248,7 +248,7 @@ class TrustRegion(eqx.Module):
         # what is far ahead of a radius that failures made small has not converged
         promised = outcome.more | (proposal.ahead > taken_by_rounding(before))
         outcome = outcome._replace(more=promised)
-        tried, failed, held, long, fails, _ = outcome
+        tried, failed, very_successful, long, fails, _ = outcome
         shorter = (self.fails > 0) & (length < _SHORTER * self.length)
         more = jnp.all(rows[best] == row) | (shorter & (error >= _SMOOTH * self.error))
         rough = jnp.where(more, self.rough + 1, self.rough)
@@ -260,15 +260,15 @@ class TrustRegion(eqx.Module):
         wait = proposal.poor & (fails < 2) & ~self.improve & ~long
         radius = jnp.where(failed & ~wait, jnp.minimum(self.radius, length) * share, self.radius)
         # single residuals may jump while the loss comes down as predicted
-        radius = jnp.where(held, jnp.maximum(radius, 2 * length), radius)
+        radius = jnp.where(very_successful, jnp.maximum(radius, 2 * length), radius)
         asked = proposal.check & good[0] & compared
         check = checked(row, rows[0], proposal.predicted[0], proposal.ahead, asked)
         after = jnp.minimum(check.factor * radius, jnp.maximum(radius, 1))
         radius = jnp.where(tried | self.improve | lost | level | self.check, radius, after)
         improve = (failed | level) & proposal.poor & ~self.improve & ~self.check
-        faster = (lowest < (1 - _LITTLE) * before) | held | check.right
+        faster = (lowest < (1 - _LITTLE) * before) | very_successful | check.right
         came = self.settled | (level & (fun <= before))
-        known = held & (error < _PREDICTED)
+        known = very_successful & (error < _PREDICTED)
         return TrustRegion(
             radius=radius,
             jacobian=proposal.jacobian,

@@ -102,10 +102,10 @@ class ValueSearch(ValueState):
 
         def first() -> "ValueSearch":
             first = self.first.known(sizes.step)
-            enough, told = first.done(), first.told()
+            enough, determined = first.done(), first.determined()
             # a scan has said how far, and a retry, too: there reach is not one
-            now = told & ~self.first.told() & jnp.all(self.first.reach == 1)
-            near = self.near * others_nearer(jnp.where(now, known.nearer(), 1), told)
+            now = determined & ~self.first.determined() & jnp.all(self.first.reach == 1)
+            near = self.near * others_nearer(jnp.where(now, known.nearer(), 1), determined)
             near = jnp.where(enough, 1, jnp.maximum(near, CARRIED))
             stage = jnp.where(enough, TRUST, FIRST).astype(self.stage.dtype)
             turn = Turn.start(len(self.start), known.history.best(self.start)[2])

@@ -99,7 +99,7 @@ class Wide(eqx.Module):
         """
         first, fun = self.taken == 0, jnp.where(good[0], jnp.sum(rows[0] ** 2) / 2, jnp.inf)
         near = jnp.max(jnp.abs(self.move / (params.sigma * self.scale))) < 1
-        held = (fun < self.before / 2) & (fun <= least) & near
+        halved = (fun < self.before / 2) & (fun <= least) & near
         newest = history.rows[-len(rows) :]
         lower = jnp.any(jnp.all(newest == lowest[None], axis=1) & good)
         return Wide(
@@ -110,7 +110,7 @@ class Wide(eqx.Module):
             before=jnp.where(first, fun, self.before),
             taken=self.taken + len(rows),
             rounds=self.rounds,
-            true=jnp.where(first, jnp.where(held, self.true + 1, 0), self.true),
+            true=jnp.where(first, jnp.where(halved, self.true + 1, 0), self.true),
             idle=jnp.where(lower, 0, self.idle + len(rows)),
             found=self.found | lower,
             seen=self.seen,
