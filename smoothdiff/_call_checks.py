@@ -25,7 +25,11 @@ _HOST = (
 
 
 def check_start(y0: PyTree) -> None:
-    """Raises ValueError if a number of the start is NaN or infinite."""
+    """Raises ValueError if the start has no number, or one that is NaN or infinite."""
+    if not sum(map(np.size, jax.tree.leaves(y0))):
+        raise ValueError(
+            "y0 is empty, there is no number in it: give at least one parameter to search for"
+        )
     for path, leaf in jax.tree_util.tree_flatten_with_path(y0)[0]:
         if jnp.issubdtype(getattr(leaf, "dtype", type(leaf)), jnp.inexact):
             numbers = np.asarray(leaf)

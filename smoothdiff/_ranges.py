@@ -234,5 +234,7 @@ def _check_order(space: Range | Integer, low: np.ndarray, high: np.ndarray) -> N
 def _refuse_outside(
     space: Range | Integer, y0: np.ndarray, low: np.ndarray, high: np.ndarray, name: str
 ) -> None:
-    why = f"lies outside its range [{space.low}, {space.high}]: start within it, or widen it"
+    why = (
+        f"lies outside its range [{space.low}, {space.high}]: choose it within, or widen the range"
+    )
     refuse((y0 < low) | (y0 > high), y0, name, why)

@@ -206,7 +206,10 @@ def _words(view: View, names: list[str], squares: bool, n: int) -> tuple[list[st
     """What was seen, and what to try."""
     seen, advice, effects = [], [], view.effects
     if not view.finite:
-        return ["the function is not finite at y0"], ["another y0: no search can begin here"]
+        advice = (
+            "another y0, unless the function is finite around this one: then a search can begin"
+        )
+        return ["the function is not finite at y0"], [advice]
     known = effects > _SEEN * view.noise
     if view.noise:
         beside = f"beside changes of {np.max(effects):.2g} within sigma"

@@ -26,6 +26,8 @@ from smoothdiff._solvers._random_numbers import takes_key
 from smoothdiff._solvers._wrapped import Wrapped
 from smoothdiff._unit_space import UnitSpace
 
+# what a checkpoint has before there was a trial
+_NO_TRIAL = Trial(np.empty(0), False)
 # the share of the time that saving may take
 _SAVING = 0.05
 _NONFINITE = "an estimate was NaN or infinite; `result` has what was found before. "
@@ -97,11 +99,13 @@ class Run:
             **({"bounds": None} | problem.options),
         )
         iterate = self.units.natural(self.y) if self.keep_iterates else None
-        saved = file.load((self.y, self.state, Record(0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, iterate)))
+        record = Record(0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, iterate)
+        saved = file.load((self.y, self.state, record, _NO_TRIAL))
         if saved is not None:
             with problem.place():
                 self.y, self.state = jax.tree.map(jnp.asarray, saved[:2])
-            self.history = _unstack(saved[2])
+            self.history, trial = _unstack(saved[2]), saved[3]
+            self.trial = Trial(trial.fun, bool(trial.noisy)) if trial.fun.size else None
             self.start -= self.history[-1].seconds
             self._check_function(file)
             problem.resumed(self.state)
@@ -142,7 +146,7 @@ class Run:
         before = time.monotonic()
         history = jax.tree.map(lambda *leaves: np.stack(leaves), *self.history[: self.steps])
         try:
-            self.file.save((self.y, self.state, history))
+            self.file.save((self.y, self.state, history, self.trial or _NO_TRIAL))
         except Exception as error:
             text = f"the checkpoint was not saved, the run goes on: {type(error).__name__}: {error}"
             warnings.warn(text, RuntimeWarning, stacklevel=2)

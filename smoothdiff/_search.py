@@ -1,30 +1,41 @@
 """`Search`: a solver that is asked for points and told their values, wherever they come from."""
 
+import itertools
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from smoothdiff._call_checks import check_bounds, check_squares, check_start
+from smoothdiff._call_checks import check_bounds, check_start
 from smoothdiff._default_solver import default_solver, share_of_range
 from smoothdiff._devices import brought, computed_on_cpu
 from smoothdiff._host_steps import HostSteps
-from smoothdiff._layout import layout_of
+from smoothdiff._numbers import check_whole
 from smoothdiff._params import as_key
-from smoothdiff._run import inexact
 from smoothdiff._solvers import AbstractSmoothSolver
 from smoothdiff._solvers._base import write_options
 from smoothdiff._solvers._box import bounds_of
 from smoothdiff._solvers._stages import LOOK, TRUST
-from smoothdiff._unit_space import UnitSpace
+from smoothdiff._told import Told
 
 # a point is given out again once so many others were told, for each that is out, and some more
 _LOST, _SOME = 2, 4
 # two programs may give the same point with so many roundings between
 _ROUNDINGS = 8
+# after so many points with natural values that are out there may be no others
+_REPEATS = 64
+# so many points of no model become wider by a width
+_WIDER = 16
+
+
+class _Out(NamedTuple):
+    """The unit vectors that have the natural values of a point, and how many were told before."""
+
+    vectors: list[np.ndarray]
+    before: int
 
 
 class Search:
@@ -86,12 +97,12 @@ class Search:
     ):
         check_start(y0)
         check_bounds(bounds, y0, space)
-        self._units = None if space is None else UnitSpace.of(y0, space)
-        if (units := self._units) is not None:
+        self._told = Told(y0, space, residuals)
+        if (units := self._told.units) is not None:
             bounds = units.bounds()
             if solver is None and sigma is None:
                 sigma = units.sigma(share_of_range(units.unit(y0), bounds, residuals))
-        self._y = brought(self._unit(y0))
+        self._y = brought(self._told.unit(y0))
         if solver is None:
             solver = default_solver(self._y, bounds, sigma, residuals)
         if not isinstance(solver, AbstractSmoothSolver) or solver.sizes(self._y) is None:
@@ -107,30 +118,33 @@ class Search:
         options = write_options(key, bounds, takes_key)
         self._key, self._takes_key = as_key(key), takes_key
         self._steps = HostSteps.of(*brought((solver, options, self._y)))
-        self._layout, self._random = layout_of(self._y), np.random.default_rng(0)
-        self._size: int | None = None
+        self._bounds, self._random = bounds, np.random.default_rng(0)
         self._over = False
         self._state = self._first(1)
-        # unit vectors that are out, with their natural values and how many were told before
-        self._out: dict[bytes, tuple[np.ndarray, bytes, int]] = {}
-        # rows that came, and wait for what the model asks for before them
+        # by the bytes of the natural values
+        self._out: dict[bytes, _Out] = {}
+        # by the bytes of the unit vector, rows that came and wait for what is asked for before
         self._came: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
     @property
     def y(self) -> PyTree:
-        """The lowest point of those that were told; with `takes_key` the solver's iterate."""
-        y = self._y if self._takes_key else self._state.progress.lowest_y
-        return self._natural(jax.tree.map(jnp.asarray, y))
+        """The lowest point of those that were told; with `takes_key` the solver's iterate.
+
+        It is the start before any value is known.
+        """
+        best = self._told.best
+        y = self._y if self._takes_key or best is None else self._told.layout.tree(best)
+        return self._told.natural(jax.tree.map(jnp.asarray, y))
 
     @property
     def fun(self) -> float:
-        """The lowest value, or half the sum of squares; infinite before anything was told."""
-        return self._state.progress.lowest_fun.item()
+        """The lowest value, or half the sum of squares; infinite before any value is known."""
+        return self._told.fun
 
     @property
     def evaluations(self) -> int:
         """How many values were told."""
-        return self._state.progress.evaluations.item() + len(self._came)
+        return self._told.count
 
     @property
     @computed_on_cpu
@@ -150,19 +164,36 @@ class Search:
 
     @computed_on_cpu
     def ask(self, count: int = 1) -> list[PyTree[np.ndarray]]:
-        """The next points to evaluate, so many of them."""
+        """The next points to evaluate, so many of them.
+
+        They differ from all that are out. Of whole numbers there may be no others: then some come
+        again.
+
+        Raises:
+            TypeError, ValueError: a count that is not whole, or negative.
+        """
+        check_whole(count, "count")
+        if (count := int(count)) < 0:
+            raise ValueError(f"count must be 0 or more, not {count}")
         late = self.evaluations - _SOME - _LOST * len(self._out)
-        self._out = {unit: out for unit, out in self._out.items() if out[2] > late}
+        self._out = {name: out for name, out in self._out.items() if out.before > late}
+        out = {vector.tobytes() for vector in self._vectors_out()}
+        wanted = self._wanted(count + len(out)) if count else iter(())
         given: list[PyTree] = []
-        for vector in self._wanted(count + len(self._out)):
-            unit = vector.tobytes()
-            if unit in self._out or unit in self._came:
+        repeats = 0
+        while len(given) < count:
+            vector = next(wanted)
+            if (unit := vector.tobytes()) in out or unit in self._came:
                 continue
-            point = jax.device_get(self._natural(self._layout.tree(jnp.asarray(vector))))
-            self._out[unit] = vector, _bytes(point), self.evaluations
-            given.append(point)
-            if len(given) == count:
-                break
+            out.add(unit)
+            point = jax.device_get(self._told.natural(self._told.layout.tree(jnp.asarray(vector))))
+            if (same := self._out.get(_bytes(point))) is None:
+                self._out[_bytes(point)] = _Out([vector], self.evaluations)
+            else:
+                same.vectors.append(vector)
+                repeats += 1
+            if same is None or repeats > _REPEATS:
+                given.append(point)
         return given
 
     @computed_on_cpu
@@ -170,16 +201,45 @@ class Search:
         """The values at these points; NaN for an evaluation that failed.
 
         Raises:
-            ValueError: another number of values, or of residuals; a NaN that the solver refuses.
+            TypeError, ValueError: another number of values, or of residuals; a NaN that the solver
+                refuses; a point beyond the bounds, or of other shapes than y0. Then nothing of the
+                call is taken in.
         """
         if len(points) != len(values):
             raise ValueError(f"{len(points)} points but {len(values)} values: tell one for each")
-        rows = [self._row(value) for value in values]
-        for point, row in zip(points, rows, strict=True):
-            same = [u for u, out in self._out.items() if out[1] == _bytes(point)]
-            vectors = [self._out.pop(unit)[0] for unit in same] or [self._vector(point)]
-            for vector in vectors:
-                self._came[vector.tobytes()] = vector, row
+        told, names = self._told, list(map(_bytes, points))
+        vectors = [
+            self._out[name].vectors if name in self._out else [told.vector(point, self._bounds)]
+            for name, point in zip(names, points, strict=True)
+        ]
+        known = told.size
+        rows = told.rows(values, finite=self.solver.nonfinite == "propagate")
+        if known is None and (told.size or 1) > 1:
+            self._state = self._first(told.size)
+            self._came = {u: (v, np.resize(row, told.size)) for u, (v, row) in self._came.items()}
+        for name, alike, row in zip(names, vectors, rows, strict=True):
+            self._out.pop(name, None)
+            told.counted(alike[0], row)
+            for vector in alike:
+                self._take(vector, row)
+        self._digest()
+
+    def _take(self, vector: np.ndarray, row: np.ndarray) -> None:
+        """Keeps a row until it is asked for; one that the same point had before is learnt."""
+        if (unit := vector.tobytes()) in self._came:
+            self._digest()
+            if unit in self._came:
+                self._learn(unit)
+        self._came[unit] = vector, row
+
+    def _learn(self, unit: bytes) -> None:
+        """Takes in what came, whatever the model asks for next."""
+        vector, row = self._came.pop(unit)
+        known = jnp.asarray(vector)[None], jnp.asarray(row)[None]
+        self._state = self._steps.learnt(self._y, self._state, *known)
+
+    def _digest(self) -> None:
+        """Takes in all that can be."""
         while self._digested():
             pass
 
@@ -194,13 +254,13 @@ class Search:
             return True
         later = set()
         if self._state.search.stage != TRUST and self._came:
-            later = {v.tobytes() for v in self._round(len(self._came) + len(self._out) + 1)}
-        for unit in [unit for unit in self._came if unit not in later]:
-            vector, row = self._came.pop(unit)
-            known = jnp.asarray(vector)[None], jnp.asarray(row)[None]
-            self._state = self._steps.learnt(self._y, self._state, *known)
-            return True
-        return False
+            later = {
+                v.tobytes() for v in self._round(len(self._came) + len(self._vectors_out()) + 1)
+            }
+        early = next((unit for unit in self._came if unit not in later), None)
+        if early is not None:
+            self._learn(early)
+        return early is not None
 
     def _same(self, point: np.ndarray) -> bytes | None:
         """What came of this point, which may be rounded otherwise in a program for more of them."""
@@ -231,8 +291,10 @@ class Search:
         # so wide that there are other points, where a radius has come to nothing
         least = np.sqrt(np.finfo(here.dtype).eps) * np.maximum(sigma, np.abs(here))
         width = np.maximum(sigma * np.asarray(search.width()), least)
-        while True:
-            yield self._clipped(here + width * self._random.standard_normal(width.shape))
+        for k in itertools.count():
+            # ever wider, as whole numbers nearby may all be out
+            step = (1 + k / _WIDER) * width * self._random.standard_normal(width.shape)
+            yield self._clipped(here + step)
 
     def _round(self, count: int) -> list[np.ndarray]:
         """The next points of this round, and of no later one; or a step and points beside it."""
@@ -240,40 +302,15 @@ class Search:
         count = 1 << (count - 1).bit_length()
         return list(np.asarray(self._steps.propose(self._y, self._state, count)[0]))
 
+    def _vectors_out(self) -> list[np.ndarray]:
+        return [vector for each in self._out.values() for vector in each.vectors]
+
     def _clipped(self, vector: np.ndarray) -> np.ndarray:
         params = self._steps.parts(self._y, self._state).params()
         return np.asarray(params.clip(jnp.asarray(vector, params.theta.dtype)))
 
-    def _natural(self, y: PyTree) -> PyTree:
-        return y if self._units is None else self._units.natural(y)
-
-    def _unit(self, y: PyTree) -> PyTree[Array]:
-        return jax.tree.map(inexact, y if self._units is None else self._units.unit(y))
-
-    def _vector(self, point: PyTree) -> np.ndarray:
-        return np.asarray(self._layout.vector(jax.tree.leaves(self._unit(point))))
-
-    def _row(self, value: Any) -> np.ndarray:
-        leaves = [np.ravel(np.asarray(leaf)) for leaf in jax.tree.leaves(value)]
-        row = np.concatenate(leaves).astype(self._layout.dtype)
-        if self._size is None and not (row.size == 1 and np.isnan(row[0])):
-            if self.solver.squares:
-                check_squares(row)
-            self._size = row.size
-            self._state = self._first(row.size) if row.size > 1 else self._state
-        if row.size == 1 and np.isnan(row[0]):
-            row = np.full(self._size or 1, np.nan, row.dtype)
-        if row.size != (self._size or 1) or (row.size > 1 and not self.solver.squares):
-            raise ValueError(
-                f"{row.size} numbers were told for a point, not {self._size}: tell "
-                + ("residuals of one shape" if self.solver.squares else "one number, or residuals")
-            )
-        if self.solver.nonfinite == "propagate" and not np.all(np.isfinite(row)):
-            raise ValueError('a value is not finite: give the solver nonfinite="drop"')
-        return row
-
     def _first(self, size: int) -> Any:
-        out = jax.ShapeDtypeStruct((size,) if self.solver.squares else (), self._layout.dtype)
+        out = jax.ShapeDtypeStruct((size,) if self.solver.squares else (), self._told.layout.dtype)
         return self._steps.init(self._y, out)
 
 
