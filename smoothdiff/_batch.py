@@ -82,6 +82,7 @@ def evaluate(
 
     def rows(z: Array, log_ratio: Array | None):
         values, aux = jax.vmap(row, in_axes=(0, None if free_rows is None else 0))(z, free)
+        values = jax.tree.map(_fine_enough, values)
         if isinstance(aux, Seen):
             # here, so that points need no more memory than a chunk of them
             aux = jax.tree.map(lambda a: a[None], aux.lowest())
@@ -94,7 +95,7 @@ def evaluate(
     if baseline.slope:
         center = _slope(lambda z: row(z, params.free)[0], jnp.zeros_like(theta))
     elif extra:
-        center = fun(params.clip(theta), params.free)[0]
+        center = jax.tree.map(_fine_enough, fun(params.clip(theta), params.free)[0])
     if support is not None:
         if params.free:
             raise ValueError("support needs a sigma for every leaf of the parameters")
@@ -102,6 +103,8 @@ def evaluate(
         _check_support(support, params, baseline, values, log_ratio)
     valid = None
     if nonfinite == "drop":
+        # nothing is subtracted where there is no such value
+        center = jax.tree.map(lambda c: jnp.where(jnp.isfinite(c), c, 0), center)
         valid = jnp.stack([_finite(v) for v in jax.tree.leaves(values)]).all(axis=0)
         values = jax.tree.map(lambda v: jnp.where(_like(valid, v), v, 0), values)
     # compiled as a whole even where the caller does not jit: op by op that takes seconds
@@ -135,6 +138,12 @@ def _like(rows: Array, values: Array) -> Array:
 
 def _finite(values: Array) -> Array:
     return jnp.isfinite(values).reshape(values.shape[0], -1).all(axis=1)
+
+
+def _fine_enough(values: Array) -> Array:
+    """In float32 at least: sums of many float16 overflow, and differences are rounding."""
+    coarse = jnp.issubdtype(values.dtype, jnp.floating) and jnp.finfo(values.dtype).bits < 32
+    return values.astype(jnp.float32) if coarse else values
 
 
 def _check_values(values: PyTree) -> None:

@@ -202,7 +202,8 @@ def _jax_function(host: HostFunction, outputs: Outputs) -> Callable[..., Any]:
         raise TypeError(
             f"the black box {host.name!r} has no derivative: smooth the function that calls it, "
             "for example with sd.smooth(fun, sigma) or sd.smooth_grad(fun, sigma), "
-            "or stop the derivative with jax.lax.stop_gradient"
+            "or stop the derivative with jax.lax.stop_gradient. A leaf whose sigma is None and "
+            'baseline="ad" need one, too'
         )
 
     return call

@@ -188,7 +188,7 @@ class Call:
     def shifted_argnums(self, num_args: int) -> int | tuple[int, ...]:
         """Where the parameters stand among the arguments of the smoothed function, key first."""
         chosen = tuple(i + 1 for i in as_argnums(self.argnums, num_args))
-        return chosen[0] if isinstance(self.argnums, int) else chosen
+        return chosen if isinstance(self.argnums, Sequence) else chosen[0]
 
     def only_smoothed(self, params: Params, what: str) -> None:
         if params.free:

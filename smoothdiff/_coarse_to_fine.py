@@ -14,6 +14,7 @@ from jaxtyping import PyTree
 
 from smoothdiff._params import as_key
 from smoothdiff._result import Record, Result
+from smoothdiff._solvers import AbstractSmoothSolver
 
 # a coarse level ends where the lowest value fell by less than this share within its patience, which
 # is counted in evaluations per parameter and one more
@@ -170,7 +171,7 @@ def coarse_to_fine(
         y = found.y
         search.narrower(level.cost / dearer.cost)
     found = search.run(levels[-1], y, callback=callback, target=target)
-    again = len(levels) > 1 and search.room(levels[-1], y0) and found.reason in _WELL
+    again = len(levels) > 1 and search.room(levels[-1], y0, looked=True) and found.reason in _WELL
     # one that was led astray
     if again and search.lower(levels[-1], y0):
         search.run(levels[-1], y0, callback=callback, target=target)
@@ -223,10 +224,12 @@ class _Search:
         self.results.append(found)
         return found
 
-    def room(self, level: Level, y: PyTree) -> bool:
-        """Whether a step of that level can be paid for."""
+    def room(self, level: Level, y: PyTree, looked: bool = False) -> bool:
+        """Whether a step of that level can be paid for, after a look at whether y is `lower`."""
         solver, like = self.results[-1].solver, jax.tree.map(jnp.asarray, y)
         needed = solver.evaluations_per_step(like) + solver.final_evaluations(like)
+        if looked:
+            needed += 2 if self.options.get("takes_key", False) else 1
         return self.max_cost is None or self._left(level) >= needed
 
     def narrower(self, share: float):
@@ -237,7 +240,9 @@ class _Search:
             share = max(share, found.fun / max(found.history[0].fun, found.fun, _TINY))
         sigma = jax.tree.map(lambda s: s * math.sqrt(share), found.solver.sigma)
         solver = dataclasses.replace(found.solver, sigma=sigma)
+        # a support is the default solver's, which has it now
         self.options = self.options | {"solver": solver, "sigma": None}
+        self.options.pop("support", None)
 
     def lower(self, level: Level, y: PyTree) -> bool:
         """Whether the function is lower at y than at what was found, by the same random numbers."""
@@ -284,5 +289,8 @@ def _check(levels: Any, max_cost: float | None, options: dict[str, Any]):
         raise ValueError(f"max_cost={max_cost} must be a positive number, or None for no limit")
     for name in options.keys() & {"max_evaluations", "max_steps", "checkpoint"}:
         raise ValueError(f"{name}= is of one level: use max_cost, max_seconds or target")
-    if callable(getattr(options.get("solver"), "sigma", None)):
+    solver = options.get("solver")
+    if solver is not None and not isinstance(solver, AbstractSmoothSolver):
+        raise TypeError("give the solver itself, such as GaussNewton(sigma), not one around it")
+    if callable(getattr(solver, "sigma", None)):
         raise ValueError("a solver whose sigma is a schedule cannot be for several levels")

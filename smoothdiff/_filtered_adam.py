@@ -142,7 +142,7 @@ def scale_by_filtered_adam(
                 bound = _unbiased(b2, bound, step)
             # rounding in a filter may leave v a little below zero
             scaled = jax.tree.map(
-                lambda m, v: m / (jnp.sqrt(jnp.abs(v)) + _scalar(eps, m)), scaled, bound
+                lambda m, v: m / (jnp.sqrt(jnp.abs(v)) + jnp.asarray(eps, m.dtype)), scaled, bound
             )
         return scaled, FilteredAdamState(step, m if keep_m else None, v if keep_v else None)
 
@@ -220,14 +220,22 @@ def _remembers(decay: Scale) -> bool:
 
 
 def _average(decay: Scale, tree: PyTree, moment: PyTree) -> PyTree:
-    return jax.tree.map(
-        lambda new, old: _scalar(decay, new) * old + (1 - _scalar(decay, new)) * new, tree, moment
-    )
+    def average(new: Array, old: Array) -> Array:
+        share = _scalar(decay, new)
+        fine = lambda x: x.astype(share.dtype)
+        return (share * fine(old) + (1 - share) * fine(new)).astype(old.dtype)
+
+    return jax.tree.map(average, tree, moment)
 
 
 def _unbiased(decay: Scale, tree: PyTree, step: Any) -> PyTree:
-    return jax.tree.map(lambda x: x / (1 - _scalar(decay, x) ** _scalar(step, x)), tree)
+    def unbiased(x: Array) -> Array:
+        share = 1 - _scalar(decay, x) ** _scalar(step, x)
+        return (x.astype(share.dtype) / share).astype(x.dtype)
+
+    return jax.tree.map(unbiased, tree)
 
 
 def _scalar(x: Scale, like: Array) -> Array:
-    return jnp.asarray(x, like.dtype)
+    # in bfloat16 a decay of 0.999 is one
+    return jnp.asarray(x, max(like.dtype, jnp.float32, key=lambda dtype: jnp.finfo(dtype).bits))

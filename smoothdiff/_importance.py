@@ -19,9 +19,10 @@ import numpy as np
 from jaxtyping import Array, Int, PyTree
 
 from smoothdiff import kernels
-from smoothdiff._baselines import AbstractBaseline
+from smoothdiff._baselines import AbstractBaseline, Mean
 from smoothdiff._call import Call
 from smoothdiff._estimate import objective
+from smoothdiff._named_baselines import Auto, as_baseline
 from smoothdiff._params import as_first_key
 from smoothdiff._samplers import PointSampler
 
@@ -115,10 +116,12 @@ class Importance(eqx.Module):
         Args:
             fun: a function with a scalar output.
             sigma: as for `smooth`, but a positive width for every leaf.
-            argnums, ..., nonfinite: see `Options`; `num_samples` is for each element.
+            argnums, ..., nonfinite: see `Options`; `num_samples` is for each element. With
+                `blur="own"` the default baseline is "mean".
 
         Raises:
-            ValueError, TypeError: as `smooth`; an output that is no scalar; a sigma of None.
+            ValueError, TypeError: as `smooth`; an output that is no scalar; a sigma of None; with
+                `blur="own"` a baseline that is fitted.
         """
         call = Call(
             fun,
@@ -130,6 +133,12 @@ class Importance(eqx.Module):
             batch_size=batch_size,
             nonfinite=nonfinite,
         )
+        if self.blur == "own":
+            # the points leave the other parameters as they are, which no fit of all of them knows
+            given = as_baseline(baseline)
+            if not isinstance(given, Auto) and not given.termwise:
+                raise ValueError('blur="own" goes with baseline="mean", "center" or "none"')
+            call = replace(call, baseline=Mean() if isinstance(given, Auto) else given)
         return partial(self._derivative, call)
 
     def _derivative(self, call: Call, key: Any, *args: Any) -> PyTree:

@@ -1,10 +1,18 @@
-"""What must be a number."""
+"""What must be a number, and what is made one."""
 
 import operator
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array
+
+
+def floating(x: ArrayLike) -> Array:
+    """The array, in the default floating-point dtype unless it has one."""
+    x = jnp.asarray(x)
+    return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)
 
 
 def check_whole(value: Any, name: str) -> None:

@@ -13,6 +13,9 @@ from jaxtyping import Array, PyTree
 from smoothdiff._layout import Layout
 from smoothdiff._numbers import check_real, check_whole
 
+# raw keys, by how many words they have
+_KINDS = {2: "threefry2x32", 4: "rbg"}
+
 
 def is_concrete(x: Any) -> bool:
     """Whether the value can be looked at now, which it cannot while JAX traces it."""
@@ -43,8 +46,8 @@ def _typed(key: Any, advice: str) -> Array:
     if dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key):
         if key.ndim == 0:
             return key
-    elif dtype == jnp.uint32 and key.ndim == 1 and key.size in (2, 4):
-        return jax.random.wrap_key_data(key)
+    elif dtype == jnp.uint32 and key.ndim == 1 and key.size in _KINDS:
+        return jax.random.wrap_key_data(key, impl=_KINDS[key.size])
     raise TypeError(advice)
 
 
@@ -98,14 +101,16 @@ class Params:
 def choose(args: tuple, argnums: int | Sequence[int]) -> PyTree:
     """The chosen argument, or the tuple of chosen arguments if `argnums` is a sequence."""
     chosen = as_argnums(argnums, len(args))
-    return args[chosen[0]] if isinstance(argnums, int) else tuple(args[i] for i in chosen)
+    several = isinstance(argnums, Sequence)
+    return tuple(args[i] for i in chosen) if several else args[chosen[0]]
 
 
 def replace(args: tuple, argnums: int | Sequence[int], new: PyTree) -> tuple:
     """The arguments with the chosen ones replaced; undoes `choose`."""
     chosen = as_argnums(argnums, len(args))
     out = list(args)
-    for i, value in zip(chosen, (new,) if isinstance(argnums, int) else new, strict=True):
+    several = isinstance(argnums, Sequence)
+    for i, value in zip(chosen, new if several else (new,), strict=True):
         out[i] = value
     return tuple(out)
 
@@ -188,8 +193,8 @@ def _as_real(leaf: Any, name: str) -> Array:
     if not jnp.issubdtype(leaf.dtype, jnp.floating):
         raise TypeError(
             f"the smoothed parameter{name} has dtype {leaf.dtype}: pass real floating-point "
-            "parameters, jnp.asarray(x, float), and round inside the function, or set sigma to "
-            "None there"
+            "parameters, jnp.asarray(x, float), and round inside the function, or make it another "
+            "argument of the function"
         )
     if jnp.finfo(leaf.dtype).bits < 32:
         raise TypeError(

@@ -8,7 +8,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
-from smoothdiff._spaces import AbstractSpace, Numbers, fit, floating, refuse
+from smoothdiff._numbers import floating
+from smoothdiff._spaces import AbstractSpace, Numbers, fit, refuse
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from smoothdiff._numbers import check_whole
 from smoothdiff._uniform import midpoints, uniform_bits
 
 
@@ -216,6 +217,7 @@ class Sobol(PointSampler):
     replicates: int = eqx.field(static=True, default=1)
 
     def __check_init__(self):
+        check_whole(self.replicates, "replicates")
         if self.replicates < 1:
             raise ValueError(f"replicates must be at least 1, not {self.replicates}")
 

@@ -214,9 +214,10 @@ class Search:
         ]
         known = told.size
         rows = told.rows(values, finite=self.solver.nonfinite == "propagate")
-        if known is None and (told.size or 1) > 1:
-            self._state = self._first(told.size)
-            self._came = {u: (v, np.resize(row, told.size)) for u, (v, row) in self._came.items()}
+        if known is None and (size := told.size or 1) > 1:
+            self._state = self._first(size)
+            # these failed
+            self._came = {u: (v, np.resize(row, size)) for u, (v, row) in self._came.items()}
         for name, alike, row in zip(names, vectors, rows, strict=True):
             self._out.pop(name, None)
             told.counted(alike[0], row)

@@ -127,6 +127,7 @@ def smooth_grad(
 def _value_and_grad(call: Call) -> Callable[..., Any]:
     def g(key: Any, *args: Any) -> PyTree:
         params = call.params(key, args)  # bad arguments are reported before AD hides their values
+        _check_free(params)
         if call.stderr:
             value, aux, grad, error = _first_order(call, key, args, params)
             pair = (value, aux) if call.has_aux else value
@@ -138,6 +139,16 @@ def _value_and_grad(call: Call) -> Callable[..., Any]:
         return ((value, aux) if call.has_aux else value), grad
 
     return g
+
+
+def _check_free(params: Params) -> None:
+    """Raises TypeError for a leaf that has no derivative."""
+    for leaf in params.free:
+        if not jnp.issubdtype(leaf.dtype, jnp.inexact):
+            raise TypeError(
+                f"a parameter of dtype {leaf.dtype} has no derivative: make it another argument of "
+                "the function"
+            )
 
 
 def _first_order(call: Call, key: Any, args: tuple, params: Params) -> tuple:

@@ -11,6 +11,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
+from smoothdiff._numbers import floating
 from smoothdiff._params import is_concrete
 
 # a number, or one for each number of the parameter; kept as Python numbers in tuples, so that
@@ -170,12 +171,6 @@ class AbstractSpace(abc.ABC):
             numbers = numbers.astype(int)
         object.__setattr__(self, name, _tuples(numbers.tolist()))
         return numbers
-
-
-def floating(x: ArrayLike) -> Array:
-    """The array, in the default floating-point dtype unless it has one."""
-    x = jnp.asarray(x)
-    return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)
 
 
 def fit(value: Any, like: Array) -> Array:

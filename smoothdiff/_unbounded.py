@@ -9,8 +9,9 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array
 
+from smoothdiff._numbers import floating
 from smoothdiff._params import is_concrete
-from smoothdiff._spaces import SIGMA, AbstractSpace, Numbers, fit, floating, refuse
+from smoothdiff._spaces import SIGMA, AbstractSpace, Numbers, fit, refuse
 
 
 @dataclasses.dataclass(frozen=True)

@@ -23,7 +23,8 @@ class Uniform(PointSampler):
         quasi: quasi-random points instead of independent ones.
 
     Raises:
-        ValueError: when points are drawn, an odd `num_samples` with `antithetic=True`.
+        ValueError: a half width that is not positive; when points are drawn, an odd `num_samples`
+            with `antithetic=True`.
 
     Example:
         >>> import jax, smoothdiff as sd
@@ -38,6 +39,10 @@ class Uniform(PointSampler):
     half_width: float = eqx.field(static=True, default=3.0)
     antithetic: bool = eqx.field(static=True, default=False)
     quasi: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        if not 0 < self.half_width < math.inf:
+            raise ValueError(f"half_width must be a positive number, not {self.half_width}")
 
     def scrambled_sets(self) -> int:
         return int(self.quasi)

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from smoothdiff._numbers import floating
 from smoothdiff._ranges import Integer
-from smoothdiff._spaces import SIGMA, AbstractSpace, floating
+from smoothdiff._spaces import SIGMA, AbstractSpace
 
 _LEAF = jax.tree.structure(0)
 

@@ -307,3 +307,47 @@ def test_products_in_chunks_are_compiled_once_outside_of_jit(key):
     np.testing.assert_allclose(whole(key, jnp.ones(2), jnp.ones(2), 2.0), first, rtol=1e-4)
     with pytest.raises(ValueError, match="v must have the structure and shapes"):
         g(key, jnp.ones(2), jnp.ones(3), 2.0)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float16, jnp.bfloat16])
+@pytest.mark.parametrize("num", [64, 2048])
+def test_coarse_values_are_added_up_in_float32(dtype, num):
+    """In float16 the sum of many values of 2000 overflows, and so it did from 64 on."""
+    beside = lambda x: (2000 + 64 * x).astype(dtype)
+    for baseline in ("auto", "mean", "center", "none"):
+        value, grad = sd.smooth_value_and_grad(beside, 1.0, num_samples=num, baseline=baseline)(
+            jax.random.key(0), 0.0
+        )
+        assert value == pytest.approx(2000, rel=0.02)
+        assert np.isfinite(grad)
+        if baseline != "none":
+            assert grad == pytest.approx(64, rel=0.5)
+
+
+def test_a_center_that_is_not_finite_is_dropped_too():
+    hole = lambda x: jnp.where(jnp.sum(x) == 0, jnp.nan, jnp.sum(x))
+    options: dict = {"num_samples": 65, "baseline": "center", "nonfinite": "drop"}
+    grad = sd.smooth_grad(hole, 1.0, **options)(jax.random.key(0), jnp.zeros(2))
+    assert np.all(np.isfinite(grad))
+
+
+@pytest.mark.parametrize("impl", ["threefry2x32", "rbg"])
+def test_raw_keys_are_those_of_their_kind(impl):
+    grad, key = sd.smooth_grad(jnp.sum, 0.5), jax.random.key(3, impl=impl)
+    x = jnp.ones(2)
+    np.testing.assert_array_equal(grad(jax.random.key_data(key), x), grad(key, x))
+
+
+def test_argnums_may_be_numbers_of_numpy():
+    product = lambda x, y: jnp.sum(x * y)
+    grad = sd.smooth_grad(product, 0.5, argnums=np.int64(1))(jax.random.key(0), 2.0, jnp.ones(2))
+    assert jnp.shape(grad) == (2,)
+
+
+def test_whole_numbers_are_no_parameters():
+    x = {"a": jnp.ones(2), "n": 3}
+    fun = lambda x: jnp.sum(x["a"]) * x["n"]
+    for sigma in (0.1, {"a": 0.1, "n": None}):
+        with pytest.raises(TypeError, match="another argument of the function"):
+            sd.smooth_grad(fun, sigma)(jax.random.key(0), x)
+    assert sd.smooth(fun, {"a": 0.1, "n": None})(jax.random.key(0), x) == pytest.approx(6, rel=0.1)

@@ -131,6 +131,15 @@ def test_host_functions_and_double_precision():
         assert sd.check_gradient(gradient, square, y, 0.1, key=key, num_samples=64).passed
 
 
+def test_what_rounding_hides_is_not_called_right():
+    """Beside an offset of a million a slope of one is no more than rounding in float32."""
+    beside = lambda y: 1e6 + float(y)
+    found = sd.check_gradient(lambda y: jnp.float32(-1.0), beside, 0.0, 0.1, key=jax.random.key(0))
+    assert not found.passed
+    assert found.undecided
+    assert found.low < 0 < found.high
+
+
 @pytest.mark.parametrize(
     ("changed", "message"),
     [

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 
 import smoothdiff as sd
@@ -169,6 +170,34 @@ def test_a_space_holds_at_all_levels():
     np.testing.assert_allclose(jnp.stack(found.y), [0.01, 3.0], rtol=1e-2)
 
 
+@pytest.mark.parametrize("max_cost", [113.5, 114.0, 114.5, 115.0])
+def test_what_was_found_is_returned_at_any_cost(max_cost):
+    """A look at the start costs an evaluation before the last search, which then needs room."""
+    misleading = sd.Level(lambda y, args: jnp.stack([y - 5.0]), cost=1)
+    steps = lambda y, args: jnp.stack([jnp.where(y < 2.5, y - 0.1, y - 2.0)])
+    levels = [misleading, sd.Level(steps, cost=4)]
+    found = sd.coarse_to_fine(sd.least_squares, levels, 0.2, key=KEY, sigma=0.3, max_cost=max_cost)
+    assert found.cost <= max_cost
+    assert found.fun <= 0.125  # where the cheaper level has its minimum
+
+
+def test_a_support_is_for_all_levels():
+    target = jnp.linspace(0.2, 0.8, 8)
+    steps = lambda count: sd.Level(
+        lambda y, args: jnp.floor(count * y) / count - jnp.floor(count * target) / count, cost=count
+    )
+    found = sd.coarse_to_fine(
+        sd.least_squares,
+        [steps(8), steps(64)],
+        jnp.full(8, 0.5),
+        key=KEY,
+        support=sd.local_support(0, ndim=1),
+        sigma=0.2,
+        max_cost=300,
+    )
+    assert len(found.levels) == 2
+
+
 @pytest.mark.parametrize(
     ("levels", "options", "error", "message"),
     [
@@ -184,6 +213,12 @@ def test_a_space_holds_at_all_levels():
             {"solver": sd.GaussNewton(lambda step: 0.1)},
             ValueError,
             "schedule",
+        ),
+        (
+            [bowls()[0].level],
+            {"solver": optx.BestSoFarLeastSquares(sd.GaussNewton(0.1))},
+            TypeError,
+            "the solver itself",
         ),
     ],
 )

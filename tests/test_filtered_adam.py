@@ -55,6 +55,18 @@ def test_without_filters_it_is_adam(b1, b2, dtype):
     assert jax.tree.leaves(found)[0].dtype == dtype
 
 
+@pytest.mark.parametrize("dtype", [jnp.bfloat16, jnp.float16])
+def test_coarse_dtypes_have_the_first_step_of_adam(dtype):
+    """Where a decay of 0.999 is rounded to one."""
+    ones = jnp.ones((4, 4), dtype)
+    optim = filtered_adam(0.1, eps=1e-4)
+    updates, state = optim.update(ones, optim.init(ones), ones)
+    assert updates.dtype == dtype
+    np.testing.assert_allclose(np.asarray(updates, float), -0.1, rtol=1e-2)
+    updates, _ = optim.update(ones, state, ones)
+    np.testing.assert_allclose(np.asarray(updates, float), -0.1, rtol=2e-2)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("second_moment", ["filter", "max", "none"])
 @pytest.mark.parametrize(("b1", "b2"), [(0.2, 0.36), (0.0, 0.36), (0.2, 0.0), (0.0, 0.0)])

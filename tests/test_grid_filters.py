@@ -173,6 +173,20 @@ def test_no_scale_gives_nan(sigma_d, log):
         assert np.all(np.isfinite(found))
 
 
+def test_a_scale_that_is_traced_and_wrong_gives_nan():
+    filtered = jax.jit(lambda lam: laplacian(lam, ndim=1)(jnp.array([0.0, 1.0, 0.0]), None))
+    assert np.all(np.isnan(filtered(-0.2)))
+    assert np.all(np.isfinite(filtered(0.2)))
+
+
+@pytest.mark.parametrize("integers", [np.arange(16).reshape(4, 4), jnp.full((4, 4), 5)])
+def test_whole_numbers_are_filtered_as_floats(integers):
+    floats = jnp.asarray(integers, float)
+    for filter in (cross_bilateral(1.0, 2, ndim=2), laplacian(1.0, ndim=2)):
+        found = filter(integers, integers)
+        np.testing.assert_array_equal(found, filter(floats, floats))
+
+
 def test_levels_set_the_reach():
     spike, flat = np.float32(np.arange(41) == 20), np.zeros(41, np.float32)
     for levels in (1, 2, 4):

@@ -332,3 +332,9 @@ def test_signals_and_guides_of_the_wrong_shape_are_refused():
         smooth(jnp.zeros((3, 1)), jnp.zeros((3, 2)))
     with pytest.raises(ValueError, match="positions"):
         mesh_laplacian([[0, 1, 2]], 1.0, weights="cotangent")(jnp.zeros((3, 1)), None)
+
+
+def test_whole_numbers_are_filtered_as_floats():
+    tetrahedron = [[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]]
+    found = mesh_laplacian(tetrahedron, 19.0)(jnp.full((4, 1), 5), None)
+    np.testing.assert_allclose(found, 5.0, rtol=1e-5)

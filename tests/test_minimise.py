@@ -403,6 +403,28 @@ def test_a_resumed_run_ends_with_the_same_bits(path):
     assert [p.name for p in path.parent.iterdir()] == ["run.npz"]
 
 
+def test_a_run_that_goes_on_near_its_end_counts_as_before(path):
+    """Where an evaluation has told that there is no noise, so that steps have what is left."""
+    calls = []
+
+    def host(y):
+        calls.append(y)
+        return np.float32(np.sum(np.floor(8 * np.abs(y - 1))))
+
+    box = sd.black_box(host, 0.0)
+    run = functools.partial(
+        sd.minimise, lambda y, _: box(y), jnp.zeros(2), key=KEY, max_evaluations=40
+    )
+    whole = run()
+    assert whole.evaluations == len(calls) == 40
+    with pytest.raises(StopHereError):
+        run(checkpoint=path, callback=stop_at(37))
+    for _ in range(2):  # and once more at the end
+        again = run(checkpoint=path)
+        assert (again.evaluations, again.fun) == (40, whole.fun)
+        np.testing.assert_array_equal(again.y, whole.y)
+
+
 def test_checkpoints_of_pytrees_float64_bfloat16_and_keys(path, x64):
     y0 = {"a": jnp.zeros(2, jnp.float64), "b": jnp.ones((), jnp.float32)}
     fun = lambda y, args: jnp.sum(y["a"] ** 2) + jnp.cos(y["b"]).astype(jnp.float64)

@@ -426,6 +426,26 @@ def test_evaluations_are_those_of_table_1(n):
     assert [sum(count) for count in counts] == [want for *_, want in cases]
 
 
+@pytest.mark.parametrize("blur", ["all", "own"])
+def test_importance_is_unbiased_by_default(blur):
+    """The sine, whose own derivative is smoothed by one normal number, and the sum of all."""
+    sine = lambda x: jnp.sum(jnp.sin(x)) + jnp.cos(jnp.sum(x))
+    x, smoothed = jnp.full(3, 0.3), np.exp(-0.5)
+    # the sum of all has a variance of 3 where all are smoothed, and of 1 where one is
+    inner = np.exp(-3 / 2 if blur == "all" else -0.5)
+    expected = smoothed * np.cos(0.3) - inner * np.sin(0.9)
+    estimate = sd.Importance(1, blur=blur)(sine, 1.0, num_samples=16)
+    assert_unbiased(
+        jax.vmap(lambda k: estimate(k, x))(keys(2000)), jnp.full(3, expected), resolution=0.02
+    )
+
+
+def test_points_of_one_parameter_have_no_fit():
+    for baseline in ("gp", "linear", "quadratic"):
+        with pytest.raises(ValueError, match='blur="own" goes with baseline="mean"'):
+            sd.Importance(1, blur="own")(jnp.sum, 1.0, baseline=baseline)
+
+
 # ---------------------------------------------------------------------------------------------
 # noise
 
@@ -514,6 +534,11 @@ def test_samplers_that_cannot_be():
         sd.Aggregate(3)  # pyright: ignore[reportArgumentType]
     with pytest.raises((ValueError, TypeError)):
         sd.Importance(3)  # pyright: ignore[reportArgumentType]
+    for width in (0.0, -1.0):
+        with pytest.raises(ValueError, match="half_width"):
+            sd.Uniform(half_width=width)
+    with pytest.raises(TypeError, match="replicates must be a whole number"):
+        sd.Sobol(replicates=2.0)  # pyright: ignore[reportArgumentType]
 
 
 class Wide(sd.AbstractSampler):

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Real
 
+from smoothdiff._numbers import floating
 from smoothdiff._params import is_concrete
 
 Filter = Callable[[Float[Array, "..."], Float[Array, "..."]], Float[Array, "..."]]
@@ -80,6 +81,7 @@ def cross_bilateral(
         raise ValueError(f"sigma_s={sigma_s} must be positive, in pixels; jnp.inf is a box")
 
     def filter(signal: Float[Array, "..."], guide: Float[Array, "..."]) -> Float[Array, "..."]:
+        signal, guide = floating(signal), floating(guide)
         for array in (signal, guide):
             _check_axes(array, ndim)
         if signal.shape[:ndim] != guide.shape[:ndim]:
@@ -186,6 +188,7 @@ def laplacian(lam: Scale, *, ndim: int, power: int | float = 1) -> Filter:
         raise ValueError(f"power={power} must be positive")
 
     def filter(signal: Float[Array, "..."], guide: Float[Array, "..."]) -> Float[Array, "..."]:
+        signal = floating(signal)
         _check_axes(signal, ndim)
         space, dtype = signal.shape[:ndim], signal.dtype
         # sums over all pixels could overflow, and so could the reciprocal of the largest number
@@ -195,6 +198,7 @@ def laplacian(lam: Scale, *, ndim: int, power: int | float = 1) -> Filter:
         rates = sum(np.ix_(*(2 - 2 * np.cos(np.pi * np.arange(n) / n) for n in space)))
         rates = jnp.asarray(rates, dtype).reshape(*space, *(1,) * (signal.ndim - ndim))
         gain = (1 + jnp.asarray(lam, dtype) * rates) ** -power
+        gain = jnp.where(jnp.asarray(lam) >= 0, gain, jnp.nan)
         return jax.scipy.fft.idctn(waves * gain, axes=range(ndim), norm="ortho") * size * 4
 
     return filter

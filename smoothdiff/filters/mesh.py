@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from smoothdiff._numbers import floating
 from smoothdiff._params import is_concrete
 from smoothdiff._products import dot
 from smoothdiff.filters._elimination import block_inverse
@@ -82,9 +83,10 @@ def mesh_laplacian(
         solve = _cotangent_solve(faces, lam)
 
     def filter(signal: Array, guide: Any) -> Array:
+        signal = floating(signal)
         _check_signal(signal, faces)
         for _ in range(power):
-            signal = solve(jnp.asarray(signal), guide)
+            signal = solve(signal, guide)
         return signal
 
     return filter
@@ -146,6 +148,7 @@ def mesh_bilateral(
     directions = _sphere_points(num_directions)
 
     def filter(signal: Array, guide: Any) -> Array:
+        signal = floating(signal)
         _check_signal(signal, faces)
         _check_positions(guide, signal)
         normals = vertex_normals(guide, faces).astype(signal.dtype)
