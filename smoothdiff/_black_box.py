@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import os
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -14,7 +15,7 @@ from jaxtyping import PyTree
 from smoothdiff._executors import InTurn, engine
 from smoothdiff._host_calls import HostFunction
 from smoothdiff._host_samples import BlackBoxError, Samples, wait_for
-from smoothdiff._numbers import check_whole
+from smoothdiff._numbers import check_real, check_whole
 from smoothdiff._outputs import Outputs
 from smoothdiff._params import is_concrete
 from smoothdiff._reraise import reraise, was_raised
@@ -143,6 +144,10 @@ def black_box(
             f"black_box needs a function of NumPy arrays, not {fun!r}; what it returns is out=..."
         )
     name = getattr(fun, "__name__", type(fun).__name__)
+    if timeout is not None:
+        check_real(timeout, "timeout")
+        # a longer one is none
+        timeout = None if timeout >= threading.TIMEOUT_MAX else timeout
     kept = Store(store, fun) if isinstance(store, str | os.PathLike) else None
     nan = on_error, on_nonfinite
     host = HostFunction(fun, name, batched, engine(executor), *nan, retries, timeout, kept)

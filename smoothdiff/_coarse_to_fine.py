@@ -219,7 +219,15 @@ class _Search:
             passed = time.monotonic() - self.start
             ends["max_seconds"] = max(self.max_seconds - passed, 0.0)
         key = jax.random.fold_in(self.key, len(self.results))
-        found = self.minimiser(level.fun, y, self.args, key=key, **self.options, **ends)
+        try:
+            found = self.minimiser(level.fun, y, self.args, key=key, **self.options, **ends)
+        except ValueError as error:
+            if self.results or "leaves no room" not in str(error):
+                raise
+            raise ValueError(
+                f"max_cost={self.max_cost} leaves no room for a step of the coarsest level: allow "
+                "more"
+            ) from error
         self.cost += found.evaluations * level.cost / self.unit
         self.results.append(found)
         return found
@@ -254,7 +262,7 @@ class _Search:
 
     def _value(self, level: Level, y: PyTree, *key: jax.Array) -> float:
         """The function itself at a point, which is an evaluation more."""
-        out = level.fun(y, self.args, *key)
+        out = level.fun(jax.tree.map(jnp.asarray, y), self.args, *key)
         self.cost += level.cost / self.unit
         if not self._squares():
             return float(out)

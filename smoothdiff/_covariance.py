@@ -27,6 +27,8 @@ _CURVED, _NOISY = 0.01, 0.5
 # a parameter that takes less than this share in directions that are not known is known, and so is a
 # variance of which they have less
 _SHARE = 0.01
+# it also is if they have no more of it than so many times what they have by chance, or by rounding
+_CHANCE, _EXACT = 16, 1e-12
 # sums with a parameter may be off by so many of its roundings
 _DIGITS = 8
 # residuals at a time, in float64
@@ -156,10 +158,15 @@ def covariance(
     part = directions[:, told]
     inner = part / (signal[told] - 1) @ part.T * (squares / freedom)
     # where there is no signal the parameters are taken as they are, where there is too little not
-    moves = np.sum((directions[:, none] * size[:, None]) ** 2, axis=1)
+    parts = (directions * size[:, None]) ** 2
+    moves = np.sum(parts[:, none], axis=1)
+    # by chance these directions have so much of a parameter that is known
+    chance = np.sum(parts[:, ~none] / signal[~none], axis=1)
     variances = directions**2 / np.maximum(signal, 1)
     adds = np.sum(variances[:, ~none & ~told], axis=1)
-    unknown = (moves > _SHARE) | (adds > _SHARE * np.sum(variances[:, told], axis=1))
+    unknown = (moves > np.minimum(_SHARE, _CHANCE * chance + _EXACT)) | (
+        adds > _SHARE * np.sum(variances[:, told], axis=1)
+    )
     inner[unknown] = inner[:, unknown] = np.nan
     unit = known.scale[free]
     matrix[at] = inner * unit * unit[:, None]

@@ -7,6 +7,7 @@ import concurrent.futures
 import dataclasses
 import functools
 import itertools
+import pickle
 import queue
 import time
 from collections import deque
@@ -111,6 +112,7 @@ class AtOnce:
         Raises:
             PoolLostError: the executor takes no more calls.
         """
+        _check_sent(self._executor, fun)
         came: queue.SimpleQueue[int] = queue.SimpleQueue()
         # those that have not come, in the order in which they began
         calls: dict[int, _Call] = {}
@@ -272,6 +274,18 @@ def engine(executor: Any) -> Engine:
         "executor must be a concurrent.futures.Executor, such as ThreadPoolExecutor(4) or "
         f"sd.Processes(4), or a distributed.Client of Dask, not {executor!r}"
     )
+
+
+def _check_sent(executor: Any, fun: Callable[..., Any]) -> None:
+    """Raises NotImportableError for a function that processes cannot have: no call will do."""
+    if isinstance(executor, concurrent.futures.ProcessPoolExecutor):
+        try:
+            pickle.dumps(fun)
+        except Exception as error:
+            raise NotImportableError(
+                f"{fun!r} cannot be sent to processes: define it at the top level of a module "
+                f"({error})"
+            ) from error
 
 
 def _tell(late: Late, sample: int | None, future: Any) -> None:

@@ -12,12 +12,14 @@ import optax
 from jaxtyping import Array, ArrayLike, PyTree
 from tqdm import tqdm
 
+from smoothdiff._call_checks import explained
 from smoothdiff._grey_cases import CaseSearches
 from smoothdiff._grey_lessons import Learner, Lessons
 from smoothdiff._grey_result import GreyBoxError, GreyRecord, GreyResult
 from smoothdiff._grey_run import Answer, GreyRun, GreyState, Shown
 from smoothdiff._grey_sensitivity import Sensitivity
 from smoothdiff._host_samples import BlackBoxError
+from smoothdiff._numbers import check_whole
 from smoothdiff._params import as_key, take_apart
 
 # of Adam, and what is left of it at the end
@@ -126,8 +128,10 @@ def train_grey_box(
     key, pictures = as_key(key), _pictures(pictures)
     counts = {"max_evaluations": max_evaluations, "lessons": lessons, "cases": cases}
     for name, count in counts.items():
+        check_whole(count, name)
         if count < 1:
             raise ValueError(f"{name}={count} must be a positive whole number")
+    check_whole(kept, "kept")
     if kept < 0:
         raise ValueError(f"kept={kept} must be 0 or more")
     weights, static = eqx.partition(model, eqx.is_inexact_array)
@@ -211,6 +215,8 @@ def _pictures(pictures: Any) -> Array:
         )
     if not jnp.issubdtype(pictures.dtype, jnp.floating):
         raise TypeError(f"pictures have dtype {pictures.dtype}: use pictures.astype(float)")
+    if not jnp.all(jnp.isfinite(pictures)):
+        raise ValueError("a picture has numbers that are not finite: leave it out")
     return pictures
 
 
@@ -225,7 +231,8 @@ def _parts(
     params = take_apart(zeros, sigma, None)
     if params.free:
         raise ValueError("train_grey_box needs a sigma for every parameter of the renderer")
-    picture = jax.eval_shape(render, said)
+    with explained():
+        picture = jax.eval_shape(render, said)
     if getattr(picture, "shape", None) != pictures.shape[1:]:
         raise ValueError(
             f"render gives {picture}, and a picture has shape {pictures.shape[1:]}: both must be "

@@ -19,6 +19,7 @@ from smoothdiff._grey_result import GreyRecord, GreyResult
 from smoothdiff._grey_sensitivity import Moved, Sensitivity
 from smoothdiff._identity import listed
 from smoothdiff._layout import Layout
+from smoothdiff._numbers import floating
 from smoothdiff._reraise import reraise
 
 # the share of the time that saving may take
@@ -47,7 +48,7 @@ class Shown(eqx.Module):
 
     def __call__(self, x: Array) -> Array:
         """The picture."""
-        return jnp.asarray(self.render(self.layout.tree(self.sigma * x)))
+        return floating(self.render(self.layout.tree(self.sigma * x)))
 
 
 class GreyState(eqx.Module):

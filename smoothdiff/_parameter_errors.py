@@ -1,6 +1,7 @@
 """The errors of least-squares parameters in natural values, from the evaluations of a run."""
 
 import dataclasses
+import math
 import warnings
 from typing import NamedTuple
 
@@ -36,6 +37,12 @@ class Answer(NamedTuple):
         high = layout.vector(side_leaves(high, np.inf, self.y))
         return np.asarray(low), np.asarray(high)
 
+    def _rounded(self, points: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
+        """As the function saw them, where leaves have other dtypes than the vector."""
+        leaves = jax.tree.leaves(layout_of(self.y).tree(points))
+        flat = [np.reshape(leaf, (len(points), math.prod(leaf.shape[1:]))) for leaf in leaves]
+        return np.concatenate(flat, axis=1)
+
     def with_rows(self, points: Float[np.ndarray, "m n"], rows: Float[Array, "m P"]) -> "Answer":
         """With the residuals at further points; those that are not finite are left out."""
         values = np.asarray(rows)
@@ -48,7 +55,7 @@ class Answer(NamedTuple):
         points, rows = np.asarray(history.points)[valid], np.asarray(history.rows)[valid]
         points = np.concatenate([points, *(point for point, _ in self.more)])
         rows = np.concatenate([rows, *(row for _, row in self.more)])
-        here = np.flatnonzero(np.all(points == self.vector(), axis=1))
+        here = np.flatnonzero(np.all(self._rounded(points) == self.vector(), axis=1))
         return points, rows, int(here[-1]) if len(here) else None
 
 

@@ -190,8 +190,8 @@ class Run:
             self.save()
         return record
 
-    def judged(self, reason: str) -> Result:
-        """The result of a run that ended well."""
+    def judged(self, reason: str, target: float | None = None) -> Result:
+        """The result of a run that ended well, for this reason or with the target."""
         with reraise(), self.problem.place():
             judged = self.problem.judge(self.y, self.state, self.trial)
             y, stats = jax.block_until_ready(judged)
@@ -199,7 +199,9 @@ class Run:
         if not np.isfinite(stats["fun"]):
             raise self._nonfinite()
         numbers = {name: value.item() for name, value in stats.items()}
-        return self._result(y, reason, **numbers)
+        # the judgement may be what finds it
+        reached = target is not None and numbers["fun"] <= target
+        return self._result(y, "target" if reached else reason, **numbers)
 
     def _ours(self) -> Any:
         """The solver, or the one of ours within another."""
@@ -210,6 +212,10 @@ class Run:
         return isinstance(self._ours(), optx.AbstractLeastSquaresSolver)
 
     def _nonfinite(self, progress: Progress | None = None, overflowed=False) -> MinimiseError:
+        sigma, step = getattr(self._ours(), "sigma", None), self.steps
+        if callable(sigma) and not np.all(np.asarray(width := sigma(step)) > 0):
+            advice = f"sigma of step {step} is {width}: end its schedule above zero"
+            return MinimiseError(_NONFINITE + advice, self.found("nonfinite", progress))
         advice = _ADVICE[getattr(self._ours(), "nonfinite", "propagate")]
         dtype = self.state.progress.lowest_fun.dtype
         if overflowed and self._is_of_residuals() and jnp.finfo(dtype).bits < 64:

@@ -10,6 +10,8 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, Key
 
+from smoothdiff._numbers import floating
+
 
 class Selection(NamedTuple):
     """What `select` chose.
@@ -84,6 +86,12 @@ def select(
     Source: ZeroGrads (Fischer and Ritschel) leaves the choice of a surrogate's complexity to future
     work; the rule of one standard error is that of Breiman et al. 1984.
     """
+    if np.ndim(u) != 2 or np.ndim(values) != 1:
+        raise ValueError(
+            f"u must have a row for each point, and values a number, not the shapes {np.shape(u)} "
+            f"and {np.shape(values)}"
+        )
+    u, values = floating(u), floating(values)
     number = round(held_out * len(u))
     if not candidates:
         raise ValueError("select needs at least one candidate, such as smoothdiff.surrogates.MLP")
@@ -94,8 +102,8 @@ def select(
             f"held_out={held_out} of {len(u)} points leaves {len(u) - number} to fit and {number} "
             "to judge by: give more points"
         )
-    if not jnp.all(jnp.isfinite(values)):
-        raise ValueError("values must be finite: leave points out where the function failed")
+    if not (jnp.all(jnp.isfinite(values)) and jnp.all(jnp.isfinite(u))):
+        raise ValueError("points and values must be finite: leave out where the function failed")
     order = jax.random.permutation(jax.random.fold_in(key, len(candidates)), len(u))
     seen, unseen = order[number:], order[:number]
     level, spread = jnp.mean(values[seen]), jnp.std(values[seen])

@@ -122,7 +122,7 @@ def solve(
                 if loop.callback is not None and loop.callback(record):
                     reason = "callback"
                     break
-        return run.judged(reason)
+        return run.judged(reason, ends.target)
     except KeyboardInterrupt:
         return run.found("interrupted")
     except (BlackBoxError, jax.errors.JaxRuntimeError) as error:

@@ -254,6 +254,8 @@ def _translated(path: Path) -> Iterator[None]:
     try:
         yield
     except sqlite3.DatabaseError as error:
+        if error.sqlite_errorcode in (sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY):
+            raise OSError(f"{path} cannot be opened as a store of evaluations: {error}") from error
         if isinstance(error, sqlite3.OperationalError):  # locked, full, gone
             raise
         raise ValueError(f"{path} is not a store of evaluations: name another file") from error

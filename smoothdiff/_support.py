@@ -63,10 +63,16 @@ class MatrixSupport(AbstractSupport):
     terms: Array
     params: Array
     shape: tuple[int, ...] = eqx.field(static=True)
+    columns: int = eqx.field(static=True)
 
     def __call__(self, params: PyTree) -> Array:
         flat = [leaf.reshape(-1) for leaf in jax.tree.leaves(params)]
         vector = flat[0] if len(flat) == 1 else jnp.concatenate(flat)
+        if len(vector) != self.columns:
+            raise ValueError(
+                f"the matrix of the support has {self.columns} columns for {len(vector)} smoothed "
+                "parameters: give it one for each"
+            )
         sums = jax.ops.segment_sum(vector[self.params], self.terms, math.prod(self.shape))
         return sums.reshape(self.shape)
 
@@ -83,7 +89,13 @@ class MovingSupport(AbstractSupport):
     def __call__(self, params: PyTree) -> Array:
         if self.where is None:
             raise ValueError("a moving support is one only somewhere: use support.at(params)")
-        return self.around(self.where)(params)
+        support = self.around(self.where)
+        if not callable(support):
+            raise TypeError(
+                "moving_support takes a function that returns a support, such as "
+                f"sd.matrix_support(matrix), not {type(support).__name__}"
+            )
+        return support(params)
 
 
 def local_support(radius: int, *, ndim: int = 2) -> LocalSupport:
@@ -132,7 +144,8 @@ def matrix_support(matrix: Any, shape: tuple[int, ...] | None = None) -> MatrixS
         A callable for the option `support`.
 
     Raises:
-        ValueError: a shape that has not one element for each row.
+        ValueError: a shape that has not one element for each row; when it is called, another number
+            of parameters than columns.
 
     Example:
         >>> import jax, jax.numpy as jnp, numpy as np, smoothdiff as sd
@@ -142,11 +155,12 @@ def matrix_support(matrix: Any, shape: tuple[int, ...] | None = None) -> MatrixS
 
     Source: own.
     """
+    matrix = matrix if hasattr(matrix, "nonzero") else np.asarray(matrix)
     shape = (matrix.shape[0],) if shape is None else tuple(shape)
     if math.prod(shape) != matrix.shape[0]:
         raise ValueError(f"{matrix.shape[0]} rows are not terms of shape {shape}")
     terms, params = matrix.nonzero()
-    return MatrixSupport(jnp.asarray(terms), jnp.asarray(params), shape)
+    return MatrixSupport(jnp.asarray(terms), jnp.asarray(params), shape, matrix.shape[1])
 
 
 def moving_support(around: Callable[[PyTree], Callable[[PyTree], Array]]) -> MovingSupport:
@@ -247,7 +261,12 @@ def probe_support(
         z = jnp.where(moved, jax.random.normal(move, (probes, n), params.theta.dtype), 0)
         points = params.theta[None] + params.sigma[None] * jnp.concatenate([0 * z[:1], z])
         terms = jax.vmap(lambda t: fun(params.layout.tree(t, params.free), *args))(points)
-        changed = np.asarray(jnp.abs(terms[1:] - terms[:1]) > atol, np.float64)
+        values = np.asarray(terms, np.float64)
+        with np.errstate(invalid="ignore"):
+            near = np.abs(values[1:] - values[:1]) <= atol
+        # infinite or NaN in both
+        same = (values[1:] == values[:1]) | (np.isnan(values[1:]) & np.isnan(values[:1]))
+        changed = np.asarray(~(near | same), np.float64)
         changed, with_j = changed.reshape(probes, -1), np.asarray(moved, np.float64)
         together = changed.T @ with_j
         tries = with_j.sum(axis=0)[None]

@@ -227,6 +227,13 @@ def errors(
             raise ValueError(
                 f"there are {len(s)} standard errors for {len(y)} values: give one for each"
             )
+        if jax.tree.structure(stderrs) != jax.tree.structure(values):
+            raise ValueError(
+                f"stderrs must be a pytree like the values, {jax.tree.structure(values)}, not "
+                f"{jax.tree.structure(stderrs)}"
+            )
+        if np.any(s < 0):
+            raise ValueError(f"a standard error is negative: {np.min(s)}")
         low, high = y - _WITHIN * s, y + _WITHIN * s
     labels = usual if labels is None else list(labels)
     if len(labels) != len(y):

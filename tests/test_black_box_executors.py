@@ -152,3 +152,18 @@ def test_processes():
         assert "a worker crashes" in str(info.value)
         with pytest.raises(BlackBoxError, match="make a new one"):
             awaited(f, [0.0])
+
+
+def test_a_function_that_cannot_be_sent_is_no_fault_of_a_sample():
+    with concurrent.futures.ProcessPoolExecutor(1) as pool:
+        box = black_box(lambda x: float(x), 0.0, executor=pool, on_error="nan")
+        with pytest.raises(Exception, match="cannot be sent to processes"):
+            jax.block_until_ready(jax.vmap(box)(jnp.arange(3.0)))
+
+
+def test_a_timeout_without_end_is_none(threads):
+    for timeout in (float("inf"), 1e12):
+        box = black_box(np.sum, 0.0, executor=threads, timeout=timeout)
+        np.testing.assert_array_equal(jax.vmap(box)(jnp.ones((3, 2))), [2, 2, 2])
+    with pytest.raises(TypeError, match="timeout must be a real number"):
+        black_box(np.sum, 0.0, executor=threads, timeout="60")  # pyright: ignore

@@ -362,3 +362,27 @@ def test_intervals_cover_as_often_as_they_say(model, truth, size):
         inside.append((low < y) & (y < high))
     shares = np.mean(inside, axis=0)
     assert np.all(np.abs(shares - 0.95) < 3 * (0.95 * 0.05 / 100) ** 0.5), shares
+
+
+@pytest.mark.parametrize("share", [0.01, 0.09, 0.3, 1.0])
+def test_of_parameters_that_act_together_no_error_is_known(share):
+    """Each may be anything if the other goes with it, however little it does."""
+    data = times() * (1 + 0.05 * jax.random.normal(KEY, times().shape))
+    sum_of_both = lambda y: times() * (y["a"] + share * y["b"])
+    result = fitted(sum_of_both, data, {"a": 2.0, "b": 2.0})
+    with pytest.warns(UserWarning, match="no error of a, b"):
+        assert np.all(np.isnan(result.covariance))
+    alone = fitted(lambda y: times() * (y["a"] + 0 * y["b"]), data, {"a": 2.0, "b": 2.0})
+    with pytest.warns(UserWarning, match="no error of b"):
+        errors = alone.parameter_errors
+    assert 0.005 < errors["a"] < 0.05
+
+
+def test_leaves_of_two_precisions_have_errors(x64):
+    model = lambda y: y["a"] * times() + y["b"].astype(times().dtype)
+    data = noisy(model, {"a": 2.0, "b": jnp.array(1.3)}, 0.1)
+    mixed = fitted(model, data, {"a": 1.0, "b": jnp.float32(1.0)})
+    double = fitted(model, data, {"a": 1.0, "b": 1.0})
+    for name in ("a", "b"):
+        found, known = mixed.parameter_errors[name], double.parameter_errors[name]
+        np.testing.assert_allclose(found, known, rtol=1e-3)

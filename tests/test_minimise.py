@@ -382,6 +382,27 @@ def test_an_error_in_the_callback_is_the_callers():
         sd.minimise(waves, Y0, TARGET, key=KEY, solver=ADAM, callback=stop_at(2))
 
 
+def test_a_schedule_that_reaches_zero_is_blamed():
+    solver = sd.FirstOrder(optax.adam(0.05), optax.linear_schedule(0.3, 0.0, 6))
+    with pytest.raises(sd.MinimiseError, match=r"sigma of step 6 is 0\.0: end its schedule above"):
+        sd.minimise(waves, Y0, TARGET, key=KEY, solver=solver, max_steps=20)
+
+
+def test_a_target_that_the_judgement_finds_is_reached():
+    steps = lambda y, _: jnp.round(16 * (y - 1)) / 16
+    result = sd.least_squares(
+        steps,
+        jnp.zeros(4),
+        key=KEY,
+        support=sd.local_support(0, ndim=1),
+        bounds=(-2.0, 2.0),
+        target=1e-3,
+        max_evaluations=150,
+    )
+    assert result.fun <= 1e-3
+    assert result.reason == "target"
+
+
 # checkpoints
 
 

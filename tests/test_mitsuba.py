@@ -429,6 +429,36 @@ def test_vectorised_variants_render_the_same_scene(variant):
     np.testing.assert_allclose(images[0].mean(), images[1].mean(), rtol=0.01)
 
 
+def test_a_scale_below_zero_is_no_picture_and_changes_none():
+    """Mitsuba turns a sphere inside out there, and leaves it so."""
+    render = mitsuba.renderer(scene(), "ball.scale", spp=1, on_nonfinite="nan")
+    before = render(1.0)
+    for scale in (-0.1, 0.0):
+        assert np.all(np.isnan(render(scale)))
+        np.testing.assert_array_equal(render(1.0), before)
+
+
+def test_a_parameter_of_the_scene_comes_before_a_motion_of_its_name():
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(np.ones((8, 16, 3), np.float32)), "scale": 2.0}
+    render = mitsuba.renderer(scene(sky=sky), "sky.scale", spp=1)
+    assert render.initial == 2.0
+    dark, bright = (np.mean(render(scale)) for scale in (0.0, 4.0))
+    np.testing.assert_allclose(np.mean(render(2.0)), (dark + bright) / 2, rtol=1e-3)
+
+
+def test_numbers_of_numpy_are_numbers():
+    one = mitsuba.renderer(scene(), "ball.translate", spp=1, sensor=np.int64(0))
+    assert one(one.initial).shape == (12, 16, 3)
+    seeded = mitsuba.renderer(
+        scene(), "ball.translate", spp=1, seed=np.int64(3), noise="per_params"
+    )
+    assert seeded(seeded.initial).shape == (12, 16, 3)
+    with pytest.raises(TypeError, match="integer"):
+        mitsuba.renderer(scene(), "ball.translate", sensor=0.7)  # pyright: ignore
+    with pytest.raises(ValueError, match="alone: give an array"):
+        one({"ball.translate": jnp.zeros(3)})
+
+
 # Misuse
 
 
@@ -444,6 +474,7 @@ def test_vectorised_variants_render_the_same_scene(variant):
         (["cube.scale", "cube.vertex_positions"], {}, "cannot be varied together"),
         ("ball.rotate", {"axis": (0, 0, 0)}, r"axis=\(x, y, z\)"),
         ("ball.rotate", {"axis": {"ball": (0, 1)}}, r"axis=\(x, y, z\)"),
+        ("ball.rotate", {"axis": {"bal": (0, 0, 1)}}, r"axis names \['bal'\]"),
         ("ball.scale", {"noise": "white"}, "per_params"),
         ("ball.scale", {"seed": -1}, "seed"),
         ("ball.scale", {"seed": 2**32}, "seed"),

@@ -97,3 +97,23 @@ def test_a_photograph_has_three_colours(shape):
     levels = as_users_have_it(mitsuba.levels)
     with pytest.raises(ValueError, match="height, width, 3"):
         levels(scene(), "ball.translate", np.zeros(shape), spp=4)
+
+
+@pytest.mark.parametrize(
+    ("shown", "options", "match"),
+    [
+        (np.full((8, 8, 3), 255, np.uint8), {"spp": 4}, "linear RGB"),
+        (np.full((8, 8, 3), np.nan), {"spp": 4}, "finite"),
+        (np.ones((8, 8, 3)), {"spp": -5}, "spp must be at least 1"),
+        (np.ones((8, 8, 3)), {"spp": 4, "sensor": [0, 0]}, "of one sensor"),
+    ],
+)
+def test_what_is_no_photograph_is_refused(shown, options, match):
+    levels = as_users_have_it(mitsuba.levels)
+    with pytest.raises(ValueError, match=match):
+        levels(scene(), "ball.translate", shown, **options)
+
+
+def test_the_finest_level_has_the_samples_that_were_asked_for():
+    levels = mitsuba.levels(scene(), "ball.translate", np.ones((32, 32, 3), np.float32), spp=20)
+    assert levels[-1].cost == 32 * 32 * 20

@@ -356,3 +356,16 @@ def test_a_slice_with_leaves_of_two_dtypes(x64, ax):
     sd.plot.slice(fun, y, sigma=0.1, key=key, parameter="b", points=5, num_samples=8, ax=ax)
     x, f = lines(ax)["function"].get_data()
     np.testing.assert_allclose(f, 2 + x**2)
+
+
+@pytest.mark.parametrize(
+    ("stderrs", "match"),
+    [
+        ({"c_drag": 1.0, "a_mass": 0.1}, "like the values"),
+        ({"drag": 1.0, "mass": -0.1}, "negative"),
+    ],
+)
+def test_errors_are_those_of_the_parameters(stderrs, match):
+    axes = Figure().subplots()
+    with pytest.raises(ValueError, match=match):
+        sd.plot.errors({"drag": 10.0, "mass": 2.0}, stderrs, ax=axes)

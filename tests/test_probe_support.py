@@ -90,3 +90,16 @@ def test_numbers_out_of_range():
             sd.probe_support(steps, 1.0, **options)
     with pytest.raises(ValueError, match="about 300 are good"):
         sd.probe_support(steps, 1.0, num_samples=1, reach=3)
+
+
+def test_a_change_to_nan_and_of_a_switch_is_one():
+    everywhere = [0, 1, 2, 3, 4]
+    for terms in (lambda x: jnp.where(x > 0.1, jnp.nan, 0.0), lambda x: x > 0.1):
+        support = sd.probe_support(terms, 1.0, num_samples=100, reach=1)(
+            jax.random.key(0), jnp.zeros(5)
+        )
+        assert sorted(support.params.tolist()) == everywhere
+    # what is NaN before and after stands still
+    hole = lambda x: jnp.where(jnp.arange(5) == 2, jnp.nan, jnp.round(4 * x))
+    probe = sd.probe_support(hole, 1.0, num_samples=100, reach=1)
+    assert sorted(probe(jax.random.key(0), jnp.zeros(5)).params.tolist()) == [0, 1, 3, 4]

@@ -386,3 +386,10 @@ def test_workers_of_a_pool(path):
             )
             np.testing.assert_array_equal(jax.vmap(f)(xs), [1.0, np.nan, -1.0])
     assert stored(path) == {0.5: 1.0, -0.5: -1.0}
+
+
+def test_a_store_that_cannot_be_opened_is_named_at_once(tmp_path):
+    began = time.monotonic()
+    with pytest.raises(OSError, match="cannot be opened as a store"):
+        sd.black_box(lambda x: x, 0.0, store=tmp_path)(1.0)
+    assert time.monotonic() - began < 30

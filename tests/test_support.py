@@ -386,3 +386,19 @@ def test_helpers_with_numbers_out_of_range():
         sd.local_support(1, ndim=0)
     with pytest.raises(TypeError, match="around"):
         sd.moving_support(SUPPORT(THETA))  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("matrix", [np.eye(4, 3), np.roll(np.eye(5), 1, axis=0)[:4]])
+def test_a_matrix_has_a_column_for_each_parameter(matrix):
+    terms = lambda x: (jnp.round(4 * x) - 4) ** 2
+    for columns in (matrix, scipy.sparse.csr_matrix(matrix), matrix.tolist()):
+        grad = sd.smooth_grad(terms, 0.5, support=sd.matrix_support(columns))
+        with pytest.raises(ValueError, match="columns for 4 smoothed parameters"):
+            grad(jax.random.key(0), jnp.zeros(4))
+
+
+def test_a_moving_support_is_a_function():
+    support = sd.moving_support(lambda y: jnp.eye(4))  # pyright: ignore[reportArgumentType]
+    grad = sd.smooth_grad(lambda y: y**2, 0.5, support=support)
+    with pytest.raises(TypeError, match=r"such as sd\.matrix_support"):
+        grad(jax.random.key(0), jnp.zeros(4))

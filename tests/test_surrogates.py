@@ -105,11 +105,25 @@ def test_any_module_is_a_candidate():
         ([], jnp.ones(300), {}, "at least one"),
         (CANDIDATES, jnp.ones(299), {}, "one value for each"),
         (CANDIDATES, jnp.ones(300).at[3].set(jnp.nan), {}, "finite"),
+        (CANDIDATES, jnp.ones((300, 1)), {}, r"values a number, not .*\(300, 1\)"),
         (CANDIDATES, jnp.ones(300), {"held_out": 0.0}, "held_out"),
         (CANDIDATES, jnp.ones(300), {"held_out": 1.0}, "held_out"),
     ],
-    ids=["none", "lengths", "nan", "nothing held out", "all held out"],
+    ids=["none", "lengths", "nan", "column", "nothing held out", "all held out"],
 )
 def test_what_cannot_be_compared_is_refused(candidates, values, settings, match):
     with pytest.raises(ValueError, match=match):
         select(candidates, POINTS, values, key=KEY, **settings)
+
+
+def test_points_are_finite_rows_and_may_be_lists():
+    values = jnp.sum(POINTS**2, axis=1)
+    with pytest.raises(ValueError, match="points and values must be finite"):
+        select([Quadratic], POINTS.at[0, 0].set(jnp.nan), values, key=KEY, steps=10)
+    with pytest.raises(ValueError, match="a row for each point"):
+        select([Quadratic], POINTS[:, 0], values, key=KEY, steps=10)
+    settings: dict = {"key": KEY, "steps": 10}
+    lists = select([Quadratic], POINTS.tolist(), values.tolist(), **settings)
+    np.testing.assert_allclose(
+        lists.errors, select([Quadratic], POINTS, values, **settings).errors, rtol=1e-4
+    )

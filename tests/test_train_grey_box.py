@@ -332,10 +332,30 @@ def test_a_training_finds_how_much_pictures_change():
     np.testing.assert_allclose(weights, expected / np.mean(expected), rtol=1e-2)
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.int32, bool])
+def test_renders_of_whole_numbers_are_compared_as_floats(dtype):
+    """Residuals in their dtype would wrap around."""
+    whole = lambda at: (40 * render(at) + 100 > 110).astype(dtype)
+    pictures = np.stack([whole({"x": x, "y": y}) for x, *y in POSES]).astype(np.float32)
+    model = Linear(jnp.zeros((2, 4), np.float32))
+    found = sd.train_grey_box(
+        model, whole, pictures, key=jax.random.key(0), sigma=0.5, max_evaluations=2560, lessons=2
+    )
+    shown = np.stack(
+        [whole(jax.tree.map(lambda a: a[i], found.parameters)) for i in range(len(pictures))]
+    )
+    losses = ((shown.astype(np.float32) - pictures) ** 2).mean(axis=(1, 2))
+    np.testing.assert_allclose(losses, found.losses, atol=1e-6)
+
+
 def test_bad_arguments():
     for name in ("max_evaluations", "lessons", "cases"):
         with pytest.raises(ValueError, match=f"{name}=0"):
             train(**{name: 0})
+    with pytest.raises(TypeError, match="max_evaluations must be a whole number"):
+        train(max_evaluations=1500.5)
+    with pytest.raises(TypeError, match=r"sd\.black_box"):
+        train(lambda at: np.asarray(at["x"]) * np.ones((2, 2)))
     with pytest.raises(ValueError, match="kept=-1"):
         train(kept=-1)
     with pytest.raises(ValueError, match="no room for a round, which takes 256 renders"):
@@ -352,6 +372,8 @@ def test_bad_arguments():
         begin(jnp.zeros((2, 4)), render, np.zeros((3, 2, 2), np.float32))  # pyright: ignore
     with pytest.raises(ValueError, match="first axis counts the cases"):
         begin(model, render, np.zeros((0, 2, 2), np.float32))
+    with pytest.raises(ValueError, match="not finite"):
+        begin(model, render, np.full((3, 2, 2), np.nan, np.float32))
     with pytest.raises(TypeError, match="astype"):
         begin(model, render, np.zeros((3, 2, 2), int))
     with pytest.raises(TypeError, match="key"):

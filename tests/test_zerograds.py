@@ -508,3 +508,15 @@ def test_bad_settings_are_refused(change, match):
 def test_what_is_of_the_wrong_kind_is_refused(change: dict[str, Any], match):
     with pytest.raises(TypeError, match=match):
         ZeroGrads(0.1, **change)
+
+
+def test_points_anywhere_need_finite_bounds(key):
+    for bounds, match in ((None, "give bounds"), ((0.0, jnp.inf), "give finite bounds")):
+        with pytest.raises(ValueError, match=match):
+            sd.minimise(
+                lambda y, _: jnp.sum(y**2),
+                jnp.ones(2),
+                key=key,
+                solver=ZeroGrads(0.3, local=False),
+                bounds=bounds,
+            )

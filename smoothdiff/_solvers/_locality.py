@@ -114,8 +114,17 @@ def log(values: Float[Array, " N"]) -> Float[Array, " N"]:
     return jnp.where(values < 0, jnp.nan, jnp.log(jnp.maximum(values, floor)))
 
 
-def _within(params: Params, share_of: Array) -> Array:
-    """The point at these shares of the way from the lower to the upper bounds."""
+def check_box(params: Params) -> None:
+    """Raises ValueError unless there are bounds, and finite ones as far as can be told now."""
     if params.low is None or params.high is None:
         raise ValueError("local=False samples all that is within the bounds: give bounds")
+    span = params.high - params.low
+    if is_concrete(span) and not np.all(np.isfinite(span)):
+        raise ValueError("local=False samples all that is within the bounds: give finite bounds")
+
+
+def _within(params: Params, share_of: Array) -> Array:
+    """The point at these shares of the way from the lower to the upper bounds."""
+    assert params.low is not None
+    assert params.high is not None
     return params.low + (params.high - params.low) * share_of

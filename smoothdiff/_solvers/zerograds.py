@@ -28,7 +28,7 @@ from smoothdiff._solvers._base import (
 )
 from smoothdiff._solvers._descent import as_optimizer, descended
 from smoothdiff._solvers._judgement import judged, judging, one_by_one
-from smoothdiff._solvers._locality import Locality, inner_width, log, share
+from smoothdiff._solvers._locality import Locality, check_box, inner_width, log, share
 from smoothdiff._solvers._random_numbers import in_step
 from smoothdiff._solvers._replay import Replay
 from smoothdiff._solvers._surrogate_fit import Fit, Settings
@@ -200,6 +200,8 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
         step = jnp.asarray(0, jnp.int32)
         params = smoothed_params(self, y, step, options)
         self._locality(params, y, step, options)
+        if not self.local:
+            check_box(params)
         weights, _ = self._make(params, options)
         fitting = self.surrogate_optimizer.init(weights)
         batches = 1 + self._fitting(params).replay

@@ -1,6 +1,7 @@
 """`levels`: a Mitsuba scene beside a photograph, from few pixels and samples to all of them."""
 
 import math
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -50,7 +51,7 @@ def levels(
         and take a key too, for `takes_key=True`: without one the noise of an image is fixed.
 
     Raises:
-        ValueError: a photograph that is none; as `renderer`.
+        TypeError, ValueError: a photograph that is none; several sensors; as `renderer`.
 
     Example:
         >>> import jax, numpy as np, smoothdiff as sd
@@ -64,16 +65,24 @@ def levels(
 
     Source: own, as `coarse_to_fine`.
     """
-    photo = np.asarray(photo, np.float32)
+    photo = np.asarray(photo)
     if photo.ndim != 3 or photo.shape[2] != 3:
         raise ValueError(f"photo must be of shape (height, width, 3), not {photo.shape}")
+    if photo.dtype.kind != "f" or not np.all(np.isfinite(photo)):
+        raise ValueError("photo must be linear RGB: finite floating-point numbers, white is one")
+    if np.ndim(options.get("sensor", 0)):
+        raise ValueError("a photograph is of one sensor: give its number")
+    photo = photo.astype(np.float32)
+    if operator.index(spp) < 1:
+        raise ValueError(f"spp must be at least 1, not {spp}")
 
     def level(halved: int) -> Level:
         factor = 2**halved
         height, width = (side // factor for side in photo.shape[:2])
         seen = photo.reshape(height, factor, width, factor, 3).mean(axis=(1, 3))
         samples = max(spp // 4**halved, min(spp, _FEW), math.ceil(_SAMPLES / (height * width)))
-        samples = math.ceil(math.sqrt(samples)) ** 2  # as stratified samplers want it
+        # as stratified samplers want it; the finest level is as it was asked for
+        samples = math.ceil(math.sqrt(samples)) ** 2 if halved else spp
         render = renderer(scene, params, resolution=(height, width), spp=samples, **options)
 
         def residuals(y: PyTree, args: Any, key: Array | None = None) -> Array:

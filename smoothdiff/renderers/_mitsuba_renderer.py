@@ -108,7 +108,8 @@ def renderer(
     if spp is not None and operator.index(spp) < 1:
         raise ValueError(f"spp must be at least 1, or None for what the scene says, not {spp}")
     variant = check_variant(variant, scene)
-    views = np.atleast_1d(np.asarray(sensor, int)).tolist()
+    seed, single = operator.index(seed), np.ndim(sensor) == 0
+    views = [operator.index(view) for view in np.atleast_1d(sensor).tolist()]
 
     with mitsuba_with(variant):
         loaded = Scene.of(scene)
@@ -117,11 +118,14 @@ def renderer(
         initial = {name: initial_value(loaded, name, axes) for name in names}
         scene_values(loaded, initial, axes)  # raises if two names speak of the same thing
         films, size = _films(loaded, views, resolution)
-    shape = size if isinstance(sensor, int) else (len(views), *size)
+        scales = [name for name in names if (as_motion(loaded, name) or ("", ""))[1] == "scale"]
+    shape = size if single else (len(views), *size)
 
     def render(values: dict[str, np.ndarray], drawn_seed: np.ndarray | None) -> np.ndarray:
-        if not all(np.isfinite(value).all() for value in values.values()):
-            # Mitsuba leaves out a shape that is nowhere, and what remains looks like a picture.
+        nowhere = not all(np.isfinite(value).all() for value in values.values())
+        if nowhere or not all(np.all(values[name] > 0) for name in scales):
+            # Mitsuba leaves out a shape that is nowhere, and what remains looks like a picture. A
+            # shape that was turned inside out may stay so.
             return np.full(shape, np.nan, np.float32)
         noise_seed: Any = seed if noise == "fixed" else _hash(seed, values)
         if drawn_seed is not None:
@@ -140,7 +144,7 @@ def renderer(
                 )
                 for view in views
             ]
-        return images[0] if isinstance(sensor, int) else np.stack(images)
+        return images[0] if single else np.stack(images)
 
     box = black_box(
         render,
@@ -193,6 +197,8 @@ class Renderer:
         Raises:
             ValueError: If a parameter is missing, unknown, or of the wrong shape.
         """
+        if self._single and isinstance(params, Mapping):
+            raise ValueError(f"params is {next(iter(self._shapes))!r} alone: give an array")
         values = dict.fromkeys(self._shapes, params) if self._single else params
         if not isinstance(values, Mapping) or set(values) != set(self._shapes):
             got = list(values) if isinstance(values, Mapping) else type(values).__name__
@@ -235,6 +241,9 @@ def _axes(
 ) -> dict[str, Axis]:
     """Unit vectors by object, for those that rotate about one."""
     axes = {}
+    turned = {f"{name.rpartition('.')[0]}" for name in names if name.endswith(".rotate")}
+    if unknown := (set(axis) if isinstance(axis, Mapping) else set()) - turned:
+        raise ValueError(f"axis names {sorted(unknown)}, of which no 'rotate' is among {names}")
     for thing, motion in filter(None, (as_motion(loaded, name) for name in names)):
         chosen = axis.get(thing) if isinstance(axis, Mapping) else axis
         if motion == "rotate" and chosen is not None:

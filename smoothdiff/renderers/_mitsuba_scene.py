@@ -184,6 +184,8 @@ def initial_value(scene: Scene, name: str, axes: Mapping[str, Axis]) -> np.ndarr
 def as_motion(scene: Scene, name: str) -> tuple[str, str] | None:
     """The object and the kind of motion that a name stands for, if it does."""
     thing, _, motion = name.rpartition(".")
+    if name in scene.names:
+        return None  # the object has a parameter of that name, as a light of the sky its scale
     places = {f"{thing}.to_world", f"{thing}.vertex_positions"}
     return (thing, motion) if motion in _MOTIONS and not places.isdisjoint(scene.names) else None
 
