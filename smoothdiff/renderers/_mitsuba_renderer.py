@@ -241,9 +241,9 @@ def _axes(
 ) -> dict[str, Axis]:
     """Unit vectors by object, for those that rotate about one."""
     axes = {}
-    turned = {f"{name.rpartition('.')[0]}" for name in names if name.endswith(".rotate")}
-    if unknown := (set(axis) if isinstance(axis, Mapping) else set()) - turned:
-        raise ValueError(f"axis names {sorted(unknown)}, of which no 'rotate' is among {names}")
+    things = {name.rpartition(".")[0] for name in loaded.names}
+    if unknown := (set(axis) if isinstance(axis, Mapping) else set()) - things:
+        raise ValueError(f"axis names {sorted(unknown)}, of which the scene has nothing")
     for thing, motion in filter(None, (as_motion(loaded, name) for name in names)):
         chosen = axis.get(thing) if isinstance(axis, Mapping) else axis
         if motion == "rotate" and chosen is not None:
