@@ -242,7 +242,10 @@ def _make(path: Path) -> None:
                 file.execute("pragma journal_mode = wal")
                 file.executescript(_TABLES)
                 return
-        except sqlite3.OperationalError:  # several begin at once, and SQLite does not wait here
+        except sqlite3.OperationalError as error:
+            if error.sqlite_errorcode == sqlite3.SQLITE_CANTOPEN:
+                raise OSError(f"{path} cannot be opened as a store: {error}") from error
+            # several begin at once, and SQLite does not wait here
             if time.monotonic() > end:
                 raise
             time.sleep(0.01)
@@ -254,8 +257,6 @@ def _translated(path: Path) -> Iterator[None]:
     try:
         yield
     except sqlite3.DatabaseError as error:
-        if error.sqlite_errorcode in (sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY):
-            raise OSError(f"{path} cannot be opened as a store of evaluations: {error}") from error
         if isinstance(error, sqlite3.OperationalError):  # locked, full, gone
             raise
         raise ValueError(f"{path} is not a store of evaluations: name another file") from error

@@ -94,7 +94,7 @@ def test_numbers_out_of_range():
 
 def test_a_change_to_nan_and_of_a_switch_is_one():
     everywhere = [0, 1, 2, 3, 4]
-    for terms in (lambda x: jnp.where(x > 0.1, jnp.nan, 0.0), lambda x: x > 0.1):
+    for terms in (lambda x: jnp.where(abs(x) > 0.1, jnp.nan, 0.0), lambda x: abs(x) > 0.1):
         support = sd.probe_support(terms, 1.0, num_samples=100, reach=1)(
             jax.random.key(0), jnp.zeros(5)
         )

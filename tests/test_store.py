@@ -390,6 +390,6 @@ def test_workers_of_a_pool(path):
 
 def test_a_store_that_cannot_be_opened_is_named_at_once(tmp_path):
     began = time.monotonic()
-    with pytest.raises(OSError, match="cannot be opened as a store"):
+    with pytest.raises(OSError, match="cannot be opened as a store: "):
         sd.black_box(lambda x: x, 0.0, store=tmp_path)(1.0)
     assert time.monotonic() - began < 30

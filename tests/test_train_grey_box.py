@@ -336,15 +336,14 @@ def test_a_training_finds_how_much_pictures_change():
 def test_renders_of_whole_numbers_are_compared_as_floats(dtype):
     """Residuals in their dtype would wrap around."""
     whole = lambda at: (40 * render(at) + 100 > 110).astype(dtype)
-    pictures = np.stack([whole({"x": x, "y": y}) for x, *y in POSES]).astype(np.float32)
+    at = {"x": jnp.asarray(POSES[:, 0], jnp.float32), "y": jnp.asarray(POSES[:, 1:], jnp.float32)}
+    pictures = jax.vmap(whole)(at).astype(jnp.float32)
     model = Linear(jnp.zeros((2, 4), np.float32))
     found = sd.train_grey_box(
         model, whole, pictures, key=jax.random.key(0), sigma=0.5, max_evaluations=2560, lessons=2
     )
-    shown = np.stack(
-        [whole(jax.tree.map(lambda a: a[i], found.parameters)) for i in range(len(pictures))]
-    )
-    losses = ((shown.astype(np.float32) - pictures) ** 2).mean(axis=(1, 2))
+    shown = jax.vmap(whole)(found.parameters).astype(jnp.float32)
+    losses = jnp.mean((shown - pictures) ** 2, axis=(1, 2))
     np.testing.assert_allclose(losses, found.losses, atol=1e-6)
 
 
