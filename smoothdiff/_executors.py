@@ -7,7 +7,6 @@ import concurrent.futures
 import dataclasses
 import functools
 import itertools
-import pickle
 import queue
 import time
 from collections import deque
@@ -86,6 +85,7 @@ class AtOnce:
     def __init__(self, executor: Any):
         self._executor = executor
         self._hung: list[Any] = []
+        self._sendable: Callable[..., Any] | None = None  # that processes can have
 
     def outcomes(
         self,
@@ -112,7 +112,8 @@ class AtOnce:
         Raises:
             PoolLostError: the executor takes no more calls.
         """
-        _check_sent(self._executor, fun)
+        which = list(which)
+        self._check_sent(fun, which)
         came: queue.SimpleQueue[int] = queue.SimpleQueue()
         # those that have not come, in the order in which they began
         calls: dict[int, _Call] = {}
@@ -141,7 +142,7 @@ class AtOnce:
                 future.add_done_callback(functools.partial(_tell, late, of[future]))
 
         try:
-            submit(list(which))
+            submit(which)
             while calls or suspects:
                 if not calls:
                     suspect = suspects.popleft()
@@ -170,6 +171,25 @@ class AtOnce:
             raise PoolLostError(error, left) from error
         finally:
             give_up(calls.values(), _PROMPT)
+
+    def _check_sent(self, fun: Callable[..., Any], which: list[int | None]) -> None:
+        """Raises PoolLostError for a function that processes cannot have: no call will do."""
+        if (
+            type(self._executor) is not concurrent.futures.ProcessPoolExecutor
+            or fun is self._sendable
+        ):
+            return
+        from multiprocessing.reduction import ForkingPickler  # not with the package
+
+        try:
+            ForkingPickler.dumps(fun)
+        except Exception as error:
+            lost = NotImportableError(
+                f"{fun!r} cannot be sent to processes: define it at the top level of a module "
+                f"({error})"
+            )
+            raise PoolLostError(lost, which) from lost
+        self._sendable = fun
 
     def _awaited(self, came: queue.SimpleQueue, calls: dict[int, _Call], timeout: Seconds) -> int:
         """The ticket of the next call that came, or took longer than the timeout.
@@ -274,18 +294,6 @@ def engine(executor: Any) -> Engine:
         "executor must be a concurrent.futures.Executor, such as ThreadPoolExecutor(4) or "
         f"sd.Processes(4), or a distributed.Client of Dask, not {executor!r}"
     )
-
-
-def _check_sent(executor: Any, fun: Callable[..., Any]) -> None:
-    """Raises NotImportableError for a function that processes cannot have: no call will do."""
-    if isinstance(executor, concurrent.futures.ProcessPoolExecutor):
-        try:
-            pickle.dumps(fun)
-        except Exception as error:
-            raise NotImportableError(
-                f"{fun!r} cannot be sent to processes: define it at the top level of a module "
-                f"({error})"
-            ) from error
 
 
 def _tell(late: Late, sample: int | None, future: Any) -> None:

@@ -119,12 +119,13 @@ def scale_by_filtered_adam(
     def init(params: Any) -> Any:
         return FilteredAdamState(
             step=jnp.zeros((), jnp.int32) if keep_m or keep_v else None,
-            m=jax.tree.map(jnp.zeros_like, params) if keep_m else None,
-            v=jax.tree.map(jnp.zeros_like, params) if keep_v else None,
+            m=jax.tree.map(jnp.zeros_like, _fine(params)) if keep_m else None,
+            v=jax.tree.map(jnp.zeros_like, _fine(params)) if keep_v else None,
         )
 
     def update(updates: Any, state: Any, params: Any = None, **extra_args: Any) -> tuple[Any, Any]:
         step: Any = optax.safe_increment(state.step) if keep_m or keep_v else None
+        given, updates, params = updates, _fine(updates), _fine(params)
         g = _filtered(prefilter, updates, params)
         m = _average(b1, g, state.m) if keep_m else g
         scaled = _filtered(postfilter, m, params)
@@ -142,8 +143,9 @@ def scale_by_filtered_adam(
                 bound = _unbiased(b2, bound, step)
             # rounding in a filter may leave v a little below zero
             scaled = jax.tree.map(
-                lambda m, v: m / (jnp.sqrt(jnp.abs(v)) + jnp.asarray(eps, m.dtype)), scaled, bound
+                lambda m, v: m / (jnp.sqrt(jnp.abs(v)) + _scalar(eps, m)), scaled, bound
             )
+        scaled = jax.tree.map(lambda new, like: new.astype(like.dtype), scaled, given)
         return scaled, FilteredAdamState(step, m if keep_m else None, v if keep_v else None)
 
     return optax.GradientTransformationExtraArgs(init, update)
@@ -203,6 +205,16 @@ def filtered_adam(
     )
 
 
+def _fine(tree: PyTree) -> PyTree:
+    """In float32 at least: a decay of 0.999 is one in bfloat16, an eps of 1e-8 zero in float16."""
+
+    def fine(x: Array) -> Array:
+        coarse = jnp.issubdtype(x.dtype, jnp.floating) and jnp.finfo(x.dtype).bits < 32
+        return x.astype(jnp.float32) if coarse else x
+
+    return jax.tree.map(fine, tree)
+
+
 def _filtered(filter: Filter | None, tree: PyTree, params: PyTree) -> PyTree:
     if filter is None:
         return tree
@@ -220,22 +232,14 @@ def _remembers(decay: Scale) -> bool:
 
 
 def _average(decay: Scale, tree: PyTree, moment: PyTree) -> PyTree:
-    def average(new: Array, old: Array) -> Array:
-        share = _scalar(decay, new)
-        fine = lambda x: x.astype(share.dtype)
-        return (share * fine(old) + (1 - share) * fine(new)).astype(old.dtype)
-
-    return jax.tree.map(average, tree, moment)
+    return jax.tree.map(
+        lambda new, old: _scalar(decay, new) * old + (1 - _scalar(decay, new)) * new, tree, moment
+    )
 
 
 def _unbiased(decay: Scale, tree: PyTree, step: Any) -> PyTree:
-    def unbiased(x: Array) -> Array:
-        share = 1 - _scalar(decay, x) ** _scalar(step, x)
-        return (x.astype(share.dtype) / share).astype(x.dtype)
-
-    return jax.tree.map(unbiased, tree)
+    return jax.tree.map(lambda x: x / (1 - _scalar(decay, x) ** _scalar(step, x)), tree)
 
 
 def _scalar(x: Scale, like: Array) -> Array:
-    # in bfloat16 a decay of 0.999 is one
-    return jnp.asarray(x, max(like.dtype, jnp.float32, key=lambda dtype: jnp.finfo(dtype).bits))
+    return jnp.asarray(x, like.dtype)

@@ -10,8 +10,14 @@ from jaxtyping import Array
 
 
 def floating(x: ArrayLike) -> Array:
-    """The array, in the default floating-point dtype unless it has one."""
+    """The array, in the default floating-point dtype unless it has one.
+
+    Raises:
+        TypeError: it is complex.
+    """
     x = jnp.asarray(x)
+    if jnp.iscomplexobj(x):
+        raise TypeError(f"numbers of dtype {x.dtype} must be real")
     return x if jnp.issubdtype(x.dtype, jnp.floating) else x.astype(float)
 
 

@@ -186,6 +186,8 @@ class Run:
         kept = record.y if self.keep_iterates else None
         self.history.append(record._replace(y=kept, best=None))
         self.y, self.state, self.stopped = y, state, stopped
+        if self.trial is not None and self.trial.noisy:
+            self.trial = None  # of a run that had ended: another point may be lowest now
         if time.monotonic() >= self.save_due:
             self.save()
         return record
@@ -213,7 +215,8 @@ class Run:
 
     def _nonfinite(self, progress: Progress | None = None, overflowed=False) -> MinimiseError:
         sigma, step = getattr(self._ours(), "sigma", None), self.steps
-        if callable(sigma) and not np.all(np.asarray(width := sigma(step)) > 0):
+        width = sigma(step) if callable(sigma) else None
+        if not all(np.all(np.asarray(leaf) > 0) for leaf in jax.tree.leaves(width)):
             advice = f"sigma of step {step} is {width}: end its schedule above zero"
             return MinimiseError(_NONFINITE + advice, self.found("nonfinite", progress))
         advice = _ADVICE[getattr(self._ours(), "nonfinite", "propagate")]

@@ -17,7 +17,7 @@ from smoothdiff._numbers import check_whole
 from smoothdiff._params import as_key
 from smoothdiff._solvers import AbstractSmoothSolver
 from smoothdiff._solvers._base import write_options
-from smoothdiff._solvers._box import bounds_of
+from smoothdiff._solvers._box import bounds_of, closed
 from smoothdiff._solvers._stages import LOOK, TRUST
 from smoothdiff._told import Told
 
@@ -26,9 +26,9 @@ _LOST, _SOME = 2, 4
 # two programs may give the same point with so many roundings between
 _ROUNDINGS = 8
 # after so many points with natural values that are out there may be no others
-_REPEATS = 64
-# so many points of no model become wider by a width
-_WIDER = 16
+_REPEATS = 256
+# so many points of no model are near the iterate
+_NEARBY = 16
 
 
 class _Out(NamedTuple):
@@ -118,7 +118,7 @@ class Search:
         options = write_options(key, bounds, takes_key)
         self._key, self._takes_key = as_key(key), takes_key
         self._steps = HostSteps.of(*brought((solver, options, self._y)))
-        self._bounds, self._random = bounds, np.random.default_rng(0)
+        self._random = np.random.default_rng(0)
         self._over = False
         self._state = self._first(1)
         # by the bytes of the natural values
@@ -182,17 +182,19 @@ class Search:
         given: list[PyTree] = []
         repeats = 0
         while len(given) < count:
-            vector = next(wanted)
+            vector, asked = next(wanted)
             if (unit := vector.tobytes()) in out or unit in self._came:
-                continue
+                repeats += 1
+                if repeats <= _REPEATS:
+                    continue
             out.add(unit)
             point = jax.device_get(self._told.natural(self._told.layout.tree(jnp.asarray(vector))))
-            if (same := self._out.get(_bytes(point))) is None:
-                self._out[_bytes(point)] = _Out([vector], self.evaluations)
-            else:
-                same.vectors.append(vector)
-                repeats += 1
-            if same is None or repeats > _REPEATS:
+            same = self._out.get(_bytes(point))
+            if same is None:
+                self._out[_bytes(point)], repeats = _Out([vector], self.evaluations), 0
+            elif asked:
+                same.vectors.append(vector)  # the value will be that of both
+            if same is None or (repeats := repeats + 1) > _REPEATS:
                 given.append(point)
         return given
 
@@ -209,7 +211,7 @@ class Search:
             raise ValueError(f"{len(points)} points but {len(values)} values: tell one for each")
         told, names = self._told, list(map(_bytes, points))
         vectors = [
-            self._out[name].vectors if name in self._out else [told.vector(point, self._bounds)]
+            self._out[name].vectors if name in self._out else [self._within(point)]
             for name, point in zip(names, points, strict=True)
         ]
         known = told.size
@@ -219,9 +221,9 @@ class Search:
             # these failed
             self._came = {u: (v, np.resize(row, size)) for u, (v, row) in self._came.items()}
         for name, alike, row in zip(names, vectors, rows, strict=True):
-            self._out.pop(name, None)
             told.counted(alike[0], row)
-            for vector in alike:
+            # of two values for one point the second is of the first vector alone
+            for vector in alike if self._out.pop(name, None) else alike[:1]:
                 self._take(vector, row)
         self._digest()
 
@@ -277,25 +279,31 @@ class Search:
         nearest = min(away, key=away.__getitem__)
         return nearest if away[nearest] <= _ROUNDINGS * np.finfo(point.dtype).eps else None
 
-    def _wanted(self, count: int) -> Iterator[np.ndarray]:
-        """What to evaluate next, in this order, without end."""
+    def _wanted(self, count: int) -> Iterator[tuple[np.ndarray, bool]]:
+        """What to evaluate next, in this order, without end; and whether the model asked for it."""
         search = self._state.search
         if search.stage != TRUST:
-            yield from self._round(count)
+            yield from ((vector, True) for vector in self._round(count))
         else:
             # what comes of it is taken in as a step, so it must be the same to the last bit
-            yield np.asarray(self._steps.propose(self._y, self._state, 1)[0][0])
+            yield np.asarray(self._steps.propose(self._y, self._state, 1)[0][0]), True
             if count > 1:
-                yield from self._round(count)[1:]
+                yield from ((vector, True) for vector in self._round(count)[1:])
         params = self._steps.parts(self._y, self._state).params()
         sigma, here = np.asarray(params.sigma), np.asarray(search.iterate())
         # so wide that there are other points, where a radius has come to nothing
         least = np.sqrt(np.finfo(here.dtype).eps) * np.maximum(sigma, np.abs(here))
         width = np.maximum(sigma * np.asarray(search.width()), least)
+        box = params.low is not None and bool(closed(params))
         for k in itertools.count():
-            # ever wider, as whole numbers nearby may all be out
-            step = (1 + k / _WIDER) * width * self._random.standard_normal(width.shape)
-            yield self._clipped(here + step)
+            # whole numbers nearby may all be out
+            if box and k >= _NEARBY:
+                low, high = map(np.asarray, bounds_of(params))
+                point = self._random.uniform(low, high)
+            else:
+                wider = max(1, k / _NEARBY)
+                point = here + wider * width * self._random.standard_normal(width.shape)
+            yield np.asarray(params.clip(jnp.asarray(point, here.dtype))), False
 
     def _round(self, count: int) -> list[np.ndarray]:
         """The next points of this round, and of no later one; or a step and points beside it."""
@@ -305,6 +313,15 @@ class Search:
 
     def _vectors_out(self) -> list[np.ndarray]:
         return [vector for each in self._out.values() for vector in each.vectors]
+
+    def _within(self, point: PyTree) -> np.ndarray:
+        """The unit vector of a point that was not asked for, if it is within the bounds."""
+        vector = self._told.vector(point)
+        if not np.array_equal(vector, self._clipped(vector)):
+            raise ValueError(
+                f"the point {point} lies outside its bounds: leave it out, or widen them"
+            )
+        return vector
 
     def _clipped(self, vector: np.ndarray) -> np.ndarray:
         params = self._steps.parts(self._y, self._state).params()

@@ -261,11 +261,10 @@ def probe_support(
         z = jnp.where(moved, jax.random.normal(move, (probes, n), params.theta.dtype), 0)
         points = params.theta[None] + params.sigma[None] * jnp.concatenate([0 * z[:1], z])
         terms = jax.vmap(lambda t: fun(params.layout.tree(t, params.free), *args))(points)
-        values = np.asarray(terms, np.float64)
-        with np.errstate(invalid="ignore"):
-            near = np.abs(values[1:] - values[:1]) <= atol
+        terms = terms.astype(float) if terms.dtype == bool else terms
+        near = jnp.abs(terms[1:] - terms[:1]) <= atol
         # infinite or NaN in both
-        same = (values[1:] == values[:1]) | (np.isnan(values[1:]) & np.isnan(values[:1]))
+        same = (terms[1:] == terms[:1]) | (jnp.isnan(terms[1:]) & jnp.isnan(terms[:1]))
         changed = np.asarray(~(near | same), np.float64)
         changed, with_j = changed.reshape(probes, -1), np.asarray(moved, np.float64)
         together = changed.T @ with_j

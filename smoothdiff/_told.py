@@ -10,7 +10,6 @@ from jaxtyping import Array, Float, PyTree
 from smoothdiff._call_checks import check_squares
 from smoothdiff._layout import layout_of
 from smoothdiff._numbers import check_real
-from smoothdiff._params import take_apart
 from smoothdiff._run import inexact
 from smoothdiff._unit_space import UnitSpace
 
@@ -30,7 +29,7 @@ class Told:
         self.count, self.fun = 0, float("inf")
         self.best: Float[np.ndarray, " n"] | None = None
         self._space, self._residuals = space, residuals
-        self._shapes, self._treedef = jax.tree.map(np.shape, y0), jax.tree.structure(y0)
+        self._like = _described(y0)
 
     def unit(self, y: PyTree) -> PyTree[Array]:
         """The unit coordinates of natural values."""
@@ -40,17 +39,16 @@ class Told:
         """The natural values at unit coordinates."""
         return y if self.units is None else self.units.natural(y)
 
-    def vector(self, point: PyTree, bounds: Any) -> Float[np.ndarray, " n"]:
-        """A point that nobody asked for, within bounds in unit coordinates.
+    def vector(self, point: PyTree) -> Float[np.ndarray, " n"]:
+        """A point that nobody asked for.
 
         Raises:
-            TypeError, ValueError: a point unlike the start, or where no search would look.
+            TypeError, ValueError: a point unlike the start, or that its space does not hold.
         """
-        shapes = jax.tree.map(np.shape, point)
-        if jax.tree.structure(point) != self._treedef or shapes != self._shapes:
+        if (given := _described(point)) != self._like:
             raise ValueError(
-                f"a point has the shapes {shapes}, and y0 has {self._shapes}: tell a list of points"
-                " that are like y0"
+                f"a point is {given[0]} of shapes {given[1]}, and y0 is {self._like[0]} of shapes"
+                f" {self._like[1]}: tell a list of points that are like y0"
             )
         for leaf in jax.tree.leaves(point):
             check_real(leaf, "a point")
@@ -58,9 +56,7 @@ class Told:
                 raise ValueError(f"a point is not finite, {point}: leave it out")
         if self._space is not None:
             UnitSpace.of(point, self._space)
-        unit = self.unit(point)
-        take_apart(unit, 1.0, bounds)
-        return np.asarray(self.layout.vector(jax.tree.leaves(unit)))
+        return np.asarray(self.layout.vector(jax.tree.leaves(self.unit(point))))
 
     def rows(self, values: Sequence[Any], finite: bool) -> list[Float[np.ndarray, " P"]]:
         """The values as rows of one size, which is known from now on; NaN where one failed.
@@ -98,11 +94,16 @@ class Told:
 
     def _row(self, value: Any) -> Float[np.ndarray, " P"]:
         leaves = jax.tree.leaves(value)
-        if not leaves:
+        if not sum(map(np.size, leaves)):
             raise ValueError(f"a value is {value}: tell NaN for an evaluation that failed")
         for leaf in leaves:
             check_real(leaf, "a value")
         return np.concatenate([np.ravel(np.asarray(leaf, self.layout.dtype)) for leaf in leaves])
+
+
+def _described(y: PyTree) -> tuple[Any, list[tuple[int, ...]]]:
+    """The structure and the shapes of a point."""
+    return jax.tree.structure(y), list(map(np.shape, jax.tree.leaves(y)))
 
 
 def _failed(row: Float[np.ndarray, " P"]) -> bool:

@@ -253,7 +253,7 @@ def test_the_registry_finds_what_the_readme_names(capsys):
     assert all(name in printed for name in (*_registry.tasks(), *_registry.methods()))
     with pytest.raises(SystemExit):
         cli.main(["run", "no-such-task"])
-    with pytest.raises(ValueError, match="no method 'x'"):
+    with pytest.raises(SystemExit, match="There is no method 'x'; choose"):
         _registry.method("x")
 
 

@@ -157,7 +157,7 @@ def test_processes():
 def test_a_function_that_cannot_be_sent_is_no_fault_of_a_sample():
     with concurrent.futures.ProcessPoolExecutor(1) as pool:
         box = black_box(lambda x: float(x), 0.0, executor=pool, on_error="nan")
-        with pytest.raises(Exception, match="cannot be sent to processes"):
+        with pytest.raises(BlackBoxError, match="cannot be sent to processes"):
             jax.block_until_ready(jax.vmap(box)(jnp.arange(3.0)))
 
 

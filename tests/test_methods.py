@@ -181,11 +181,6 @@ def test_the_registry_knows_every_method():
     assert set(_registry.methods("network")) == {*GREY, "grey_gauss_newton"}
 
 
-def test_a_name_that_is_not_there_is_said_beside_those_that_are():
-    with pytest.raises(SystemExit, match="There is no method 'no such'; choose "):
-        _registry.method("no such")
-
-
 def test_committed_results_name_methods_by_their_titles():
     titles = {}
     for path in _study.COMMITTED.rglob("results.json"):

@@ -446,6 +446,26 @@ def test_a_run_that_goes_on_near_its_end_counts_as_before(path):
         np.testing.assert_array_equal(again.y, whole.y)
 
 
+def test_a_trial_that_showed_noise_is_of_the_run_that_it_ended(path):
+    """A longer run judges the point that is lowest then."""
+    rng = np.random.default_rng(0)
+    noisy = lambda y: np.float32(np.sum((y - 1) ** 2) + 1e-3 * rng.normal())
+    box = sd.black_box(noisy, 0.0)
+    run = functools.partial(sd.minimise, lambda y, _: box(y), jnp.full(2, 5.0), key=KEY)
+    short = run(checkpoint=path, max_evaluations=14)
+    longer = run(checkpoint=path, max_evaluations=60)
+    assert longer.fun < 0.1 < short.fun
+
+
+def test_a_schedule_of_a_pytree_that_meets_nan_keeps_what_was_found():
+    widths = lambda step: {"a": 0.1, "b": 0.2}
+    fun = lambda y, _: jnp.where(y["a"] < 0.7, jnp.nan, y["a"] ** 2 + y["b"] ** 2)
+    solver = sd.FirstOrder(optax.adam(0.2), widths)
+    y0 = {"a": jnp.array(1.5), "b": jnp.array(1.0)}
+    with pytest.raises(sd.MinimiseError, match="nonfinite"):
+        sd.minimise(fun, y0, key=KEY, solver=solver, max_steps=50)
+
+
 def test_checkpoints_of_pytrees_float64_bfloat16_and_keys(path, x64):
     y0 = {"a": jnp.zeros(2, jnp.float64), "b": jnp.ones((), jnp.float32)}
     fun = lambda y, args: jnp.sum(y["a"] ** 2) + jnp.cos(y["b"]).astype(jnp.float64)

@@ -117,3 +117,11 @@ def test_what_is_no_photograph_is_refused(shown, options, match):
 def test_the_finest_level_has_the_samples_that_were_asked_for():
     levels = mitsuba.levels(scene(), "ball.translate", np.ones((32, 32, 3), np.float32), spp=20)
     assert levels[-1].cost == 32 * 32 * 20
+
+
+@pytest.mark.parametrize("spp", [1, 3, 4])
+def test_costs_of_small_pictures_rise(spp):
+    levels = mitsuba.levels(scene(), "ball.translate", np.ones((16, 16, 3), np.float32), spp=spp)
+    costs = [level.cost for level in levels]
+    assert costs == sorted(costs)
+    assert costs[-1] == 256 * spp

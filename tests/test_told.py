@@ -45,10 +45,10 @@ def test_the_best_of_those_told_is_known_at_once():
         (3, {"space": sd.Integer(0, 5)}, 2.5, "2.5 is not a whole number"),
         ([0.5, 0.5], {"bounds": (0, 1)}, [3.0, 0.5], "lies outside its bounds"),
         ([0.5, 0.5], {}, [np.nan, 1.0], "a point is not finite"),
-        ([0.5, 0.5], {}, [0.5], "y0 has"),
-        ({"a": 0.0, "b": 1.0}, {}, {"a": 5.0, "c": 2.0}, "y0 has"),
-        (np.zeros(2), {}, 5.0, "y0 has"),
-        (np.zeros(2), {}, np.zeros(3), "y0 has"),
+        ([0.5, 0.5], {}, [0.5], "and y0 is"),
+        ({"a": 0.0, "b": 1.0}, {}, {"a": 5.0, "c": 2.0}, "and y0 is"),
+        (np.zeros(2), {}, 5.0, "and y0 is"),
+        (np.zeros(2), {}, np.zeros(3), "and y0 is"),
     ],
 )
 def test_a_point_where_no_search_looks_is_refused(y0, settings, point, match):
@@ -109,6 +109,31 @@ def test_a_point_that_is_told_again_counts_again(apart):
     ):
         search.tell(points, values)
     assert (search.evaluations, search.fun) == (2, 2.0)
+
+
+def test_large_numbers_are_numbers():
+    search = sd.Search(jnp.full(2, 3e7), key=KEY, sigma=1e6)
+    search.tell([np.full(2, 3.1e7, np.float32)], [1.0])
+    assert (search.evaluations, search.fun) == (1, 1.0)
+
+
+@pytest.mark.parametrize("residuals", [False, True])
+def test_an_empty_value_is_none(residuals):
+    search = sd.Search(jnp.zeros(2), key=KEY, residuals=residuals)
+    points = search.ask(2)
+    with pytest.raises(ValueError, match="tell NaN for an evaluation that failed"):
+        search.tell(points, [np.zeros(0), np.zeros(0)])
+    search.tell(points, [np.ones(3), np.ones(3)] if residuals else [1.0, 2.0])
+    assert search.evaluations == 2
+
+
+def test_many_whole_numbers_are_all_different():
+    for most, count in ((5, 30), (99, 150)):
+        search = sd.Search({"a": 0, "b": 1}, key=KEY, space=sd.Integer(0, most))
+        points = search.ask(count)
+        assert len({(int(y["a"]), int(y["b"])) for y in points}) == count
+    search.tell(points, [float(y["a"] + y["b"]) for y in points])
+    assert search.evaluations == count
 
 
 def test_whole_numbers_are_given_once_and_count_once():

@@ -96,4 +96,6 @@ def levels(
         min(photo.shape[:2]) >> (count + 1) >= coarsest
     ):
         count += 1
-    return [level(halved) for halved in range(count, -1, -1)]
+    levels = [level(halved) for halved in range(count, -1, -1)]
+    # a coarse one that costs more than the finest is no help
+    return [each for each in levels if each.cost <= levels[-1].cost]

@@ -44,7 +44,8 @@ def renderer(
     The function is a `smoothdiff.black_box`: it works under `jit`, `vmap`, `scan` and every
     smoothdiff transform, and has no derivative of its own. The image depends on nothing but the
     parameters, and on a key if one is given: `render(y, key)`, as `minimise` with `takes_key=True`
-    does. Parameters that are not finite give an image of NaN, hence an error or a dropped sample.
+    does. Parameters that are not finite, and a scale that is not positive, give an image of NaN:
+    an error, or with `on_nonfinite="nan"` and `nonfinite="drop"` of a solver a dropped sample.
 
     Args:
         scene: A dict as for `mitsuba.load_dict`, the path of an XML file, or a loaded scene. A
@@ -55,11 +56,11 @@ def renderer(
             has there; or a motion of a shape, camera or light, from where the scene has it:
             `"ball.translate"` (3 numbers, scene units), `"ball.rotate"` (radians: 1 number about
             an `axis`, without one 3 numbers, a rotation vector in world space), `"ball.scale"` (1
-            number, a factor). Objects are scaled, then rotated, then translated; the first two
-            about their own origin, which is the translation of their `to_world` or, for a mesh
-            without one, the centre of its bounding box. So a camera's pose is
-            `["camera.translate", "camera.rotate"]`, its field of view `"camera.x_fov"` (degrees),
-            and what an orthographic one sees `"camera.scale"`.
+            number, a positive factor: give bounds or `sd.Positive()`). Objects are scaled, then
+            rotated, then translated; the first two about their own origin, which is the translation
+            of their `to_world` or, for a mesh without one, the centre of its bounding box. So a
+            camera's pose is `["camera.translate", "camera.rotate"]`, its field of view
+            `"camera.x_fov"` (degrees), and what an orthographic one sees `"camera.scale"`.
         axis: Direction in world space that `"NAME.rotate"` turns about, anti-clockwise for a viewer
             that it points at; or a dict from object to direction, `{"mug": (0, 0, 1)}`. Others
             turn about any.
