@@ -128,7 +128,7 @@ def test_an_empty_value_is_none(residuals):
 
 
 def test_many_whole_numbers_are_all_different():
-    for most, count in ((5, 30), (99, 150)):
+    for most, count in ((5, 36), (99, 150)):
         search = sd.Search({"a": 0, "b": 1}, key=KEY, space=sd.Integer(0, most))
         points = search.ask(count)
         assert len({(int(y["a"]), int(y["b"])) for y in points}) == count

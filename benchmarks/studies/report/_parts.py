@@ -39,7 +39,7 @@ class Part(NamedTuple):
 
 # by key: the title, and what is in it: studies, "descents" or "functions"
 PARTS = {
-    "ablations": ("Ablations", ("variance", "descents")),
+    "ablations": ("Ablations", ("variance", "grey", "descents")),
     "savings": ("Savings", ("savings", "overhead", "filters")),
     "robustness": ("Robustness", ("robustness", "noise", "defaults")),
     "profiles": ("Artificial problems and data profiles", ("functions", "profiles")),
