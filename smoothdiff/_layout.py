@@ -49,7 +49,7 @@ class Layout:
                 leaves.append(next(rest))
                 continue
             stop = start + math.prod(shape)
-            leaves.append(x[..., start:stop].reshape(*x.shape[:-1], *shape).astype(dtype))
+            leaves.append(x[..., start:stop].reshape((*x.shape[:-1], *shape)).astype(dtype))
             start = stop
         return self.treedef.unflatten(leaves)
 

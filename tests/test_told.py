@@ -161,3 +161,13 @@ def test_a_start_without_a_number_is_an_error(y0):
     ):
         with pytest.raises(ValueError, match="y0 is empty"):
             call()
+
+
+def test_the_best_of_single_numbers_has_their_structure():
+    y0 = {"rate": np.float32(0.01), "teeth": 7}
+    space = {"rate": sd.Range(1e-4, 1e2, log=True), "teeth": sd.Integer(3, 20)}
+    search = sd.Search(y0, key=KEY, space=space)
+    points = search.ask(3)
+    search.tell(points, [float(y["teeth"]) for y in points])
+    assert int(search.y["teeth"]) == min(int(y["teeth"]) for y in points)
+    assert jnp.shape(search.y["rate"]) == ()
