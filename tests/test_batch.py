@@ -340,7 +340,8 @@ def test_raw_keys_are_those_of_their_kind(impl):
 
 def test_argnums_may_be_numbers_of_numpy():
     product = lambda x, y: jnp.sum(x * y)
-    grad = sd.smooth_grad(product, 0.5, argnums=np.int64(1))(jax.random.key(0), 2.0, jnp.ones(2))
+    second: Any = np.int64(1)
+    grad = sd.smooth_grad(product, 0.5, argnums=second)(jax.random.key(0), 2.0, jnp.ones(2))
     assert jnp.shape(grad) == (2,)
 
 

@@ -174,7 +174,7 @@ def test_no_scale_gives_nan(sigma_d, log):
 
 
 def test_a_scale_that_is_traced_and_wrong_gives_nan():
-    filtered = jax.jit(lambda lam: laplacian(lam, ndim=1)(jnp.array([0.0, 1.0, 0.0]), None))
+    filtered = jax.jit(lambda lam: laplacian(lam, ndim=1)(jnp.array([0.0, 1.0, 0.0]), jnp.zeros(3)))
     assert np.all(np.isnan(filtered(-0.2)))
     assert np.all(np.isfinite(filtered(0.2)))
 

@@ -447,11 +447,10 @@ def test_a_parameter_of_the_scene_comes_before_a_motion_of_its_name():
 
 
 def test_numbers_of_numpy_are_numbers():
-    one = mitsuba.renderer(scene(), "ball.translate", spp=1, sensor=np.int64(0))
+    first: Any = np.int64(0)
+    one = mitsuba.renderer(scene(), "ball.translate", spp=1, sensor=first)
     assert one(one.initial).shape == (12, 16, 3)
-    seeded = mitsuba.renderer(
-        scene(), "ball.translate", spp=1, seed=np.int64(3), noise="per_params"
-    )
+    seeded = mitsuba.renderer(scene(), "ball.translate", spp=1, seed=first, noise="per_params")
     assert seeded(seeded.initial).shape == (12, 16, 3)
     with pytest.raises(TypeError, match="integer"):
         mitsuba.renderer(scene(), "ball.translate", sensor=0.7)  # pyright: ignore

@@ -123,7 +123,8 @@ def test_points_are_finite_rows_and_may_be_lists():
     with pytest.raises(ValueError, match="a row for each point"):
         select([Quadratic], POINTS[:, 0], values, key=KEY, steps=10)
     settings: dict = {"key": KEY, "steps": 10}
-    lists = select([Quadratic], POINTS.tolist(), values.tolist(), **settings)
+    given: Any = POINTS.tolist(), values.tolist()
+    lists = select([Quadratic], *given, **settings)
     np.testing.assert_allclose(
         lists.errors, select([Quadratic], POINTS, values, **settings).errors, rtol=1e-4
     )
