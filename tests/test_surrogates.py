@@ -1,6 +1,7 @@
 """Surrogates: their shapes, closed forms and initial weights."""
 
 import functools
+from typing import Any
 
 import equinox as eqx
 import jax
