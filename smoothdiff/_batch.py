@@ -13,6 +13,7 @@ from jaxtyping import Array, PyTree
 from smoothdiff._baselines import AbstractBaseline, Control
 from smoothdiff._draws import Draws
 from smoothdiff._layout import Layout
+from smoothdiff._numbers import at_least_float32
 from smoothdiff._params import Params
 from smoothdiff._samplers import AbstractSampler
 from smoothdiff._seen import Seen
@@ -82,7 +83,7 @@ def evaluate(
 
     def rows(z: Array, log_ratio: Array | None):
         values, aux = jax.vmap(row, in_axes=(0, None if free_rows is None else 0))(z, free)
-        values = jax.tree.map(_fine_enough, values)
+        values = jax.tree.map(at_least_float32, values)
         if isinstance(aux, Seen):
             # here, so that points need no more memory than a chunk of them
             aux = jax.tree.map(lambda a: a[None], aux.lowest())
@@ -95,7 +96,7 @@ def evaluate(
     if baseline.slope:
         center = _slope(lambda z: row(z, params.free)[0], jnp.zeros_like(theta))
     elif extra:
-        center = jax.tree.map(_fine_enough, fun(params.clip(theta), params.free)[0])
+        center = jax.tree.map(at_least_float32, fun(params.clip(theta), params.free)[0])
     if support is not None:
         if params.free:
             raise ValueError("support needs a sigma for every leaf of the parameters")
@@ -138,12 +139,6 @@ def _like(rows: Array, values: Array) -> Array:
 
 def _finite(values: Array) -> Array:
     return jnp.isfinite(values).reshape(values.shape[0], -1).all(axis=1)
-
-
-def _fine_enough(values: Array) -> Array:
-    """In float32 at least: sums of many float16 overflow, and differences are rounding."""
-    coarse = jnp.issubdtype(values.dtype, jnp.floating) and jnp.finfo(values.dtype).bits < 32
-    return values.astype(jnp.float32) if coarse else values
 
 
 def _check_values(values: PyTree) -> None:

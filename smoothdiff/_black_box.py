@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import os
-import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -144,10 +143,6 @@ def black_box(
             f"black_box needs a function of NumPy arrays, not {fun!r}; what it returns is out=..."
         )
     name = getattr(fun, "__name__", type(fun).__name__)
-    if timeout is not None:
-        check_real(timeout, "timeout")
-        # a longer one is none
-        timeout = None if timeout >= threading.TIMEOUT_MAX else timeout
     kept = Store(store, fun) if isinstance(store, str | os.PathLike) else None
     nan = on_error, on_nonfinite
     host = HostFunction(fun, name, batched, engine(executor), *nan, retries, timeout, kept)
@@ -301,6 +296,8 @@ def _check(host: HostFunction, store: Any) -> None:
             "batched=True makes one call of a whole batch, which an executor cannot share out: "
             "leave out the executor, or write batched=False"
         )
+    if host.timeout is not None:
+        check_real(host.timeout, "timeout")
     if host.timeout is not None and not pool:
         raise ValueError(
             "timeout needs an executor that runs the calls, for example executor=sd.Processes(1)"

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from smoothdiff._numbers import inexact
 from smoothdiff._params import Params, as_key, take_apart
-from smoothdiff._run import inexact
 
 # a gradient that is known to this share of its largest entry is known well enough
 _ENOUGH = 0.1

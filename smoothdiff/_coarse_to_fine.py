@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import PyTree
 
+from smoothdiff._limits import NoRoomError
 from smoothdiff._params import as_key
 from smoothdiff._result import Record, Result
 from smoothdiff._solvers import AbstractSmoothSolver
@@ -135,14 +136,15 @@ def coarse_to_fine(
         max_cost: the most that all evaluations may cost, in evaluations of the finest level.
         max_seconds: seconds after which no further step begins.
         callback: called with each step's `Record`; the search ends if it returns something true.
-        **options: as for the minimiser: `bounds`, `space`, `sigma`, `solver`, `progress`,
-            `takes_key`. Sigma and a solver are for the coarsest level.
+        **options: as for the minimiser: `bounds`, `space`, `sigma`, `solver`, `support`,
+            `progress`, `takes_key`. Sigma and a solver are for the coarsest level.
 
     Returns:
         A `CoarseToFine`.
 
     Raises:
-        TypeError, ValueError: levels without costs, or from fine to coarse; as the minimiser.
+        TypeError, ValueError: levels without costs, or from fine to coarse; a solver within another
+            one; no room for a step; as the minimiser.
         MinimiseError: as the minimiser.
 
     Example:
@@ -171,7 +173,7 @@ def coarse_to_fine(
         y = found.y
         search.narrower(level.cost / dearer.cost)
     found = search.run(levels[-1], y, callback=callback, target=target)
-    again = len(levels) > 1 and search.room(levels[-1], y0, looked=True) and found.reason in _WELL
+    again = len(levels) > 1 and search.room(levels[-1], y0, search.looks) and found.reason in _WELL
     # one that was led astray
     if again and search.lower(levels[-1], y0):
         search.run(levels[-1], y0, callback=callback, target=target)
@@ -221,9 +223,7 @@ class _Search:
         key = jax.random.fold_in(self.key, len(self.results))
         try:
             found = self.minimiser(level.fun, y, self.args, key=key, **self.options, **ends)
-        except ValueError as error:
-            if self.results or "leaves no room" not in str(error):
-                raise
+        except NoRoomError as error:
             raise ValueError(
                 f"max_cost={self.max_cost} leaves no room for a step of the coarsest level: allow "
                 "more"
@@ -232,13 +232,11 @@ class _Search:
         self.results.append(found)
         return found
 
-    def room(self, level: Level, y: PyTree, looked: bool = False) -> bool:
-        """Whether a step of that level can be paid for, after a look at whether y is `lower`."""
+    def room(self, level: Level, y: PyTree, more: int = 0) -> bool:
+        """Whether a step of that level can be paid for, and so many evaluations more."""
         solver, like = self.results[-1].solver, jax.tree.map(jnp.asarray, y)
         needed = solver.evaluations_per_step(like) + solver.final_evaluations(like)
-        if looked:
-            needed += 2 if self.options.get("takes_key", False) else 1
-        return self.max_cost is None or self._left(level) >= needed
+        return self.max_cost is None or self._left(level) >= needed + more
 
     def narrower(self, share: float):
         """The next level has the same solver, whose sigma is smaller; cost is a `share` of its."""
@@ -249,8 +247,13 @@ class _Search:
         sigma = jax.tree.map(lambda s: s * math.sqrt(share), found.solver.sigma)
         solver = dataclasses.replace(found.solver, sigma=sigma)
         # a support is the default solver's, which has it now
-        self.options = self.options | {"solver": solver, "sigma": None}
-        self.options.pop("support", None)
+        rest = {name: each for name, each in self.options.items() if name != "support"}
+        self.options = rest | {"solver": solver, "sigma": None}
+
+    @property
+    def looks(self) -> int:
+        """The evaluations that `lower` takes."""
+        return 2 if self.options.get("takes_key", False) else 1
 
     def lower(self, level: Level, y: PyTree) -> bool:
         """Whether the function is lower at y than at what was found, by the same random numbers."""

@@ -24,11 +24,10 @@ _RANK = 1e-10
 # a sign, so the root of it goes into the standard errors; that of noise is another for each
 # residual, and is taken off but for its chance.
 _CURVED, _NOISY = 0.01, 0.5
-# a parameter that takes less than this share in directions that are not known is known, and so is a
-# variance of which they have less
-_SHARE = 0.01
-# it also is if they have no more of it than so many times what they have by chance, or by rounding
-_CHANCE, _EXACT = 16, 1e-12
+# a parameter is known if directions that are not known have less than this share of it, and no more
+# than so many times what they have by chance, or than rounding; a variance, if they have less than
+# this share of it
+_SHARE, _CHANCE, _EXACT = 0.01, 16, 1e-12
 # sums with a parameter may be off by so many of its roundings
 _DIGITS = 8
 # residuals at a time, in float64
@@ -164,9 +163,8 @@ def covariance(
     chance = np.sum(parts[:, ~none] / signal[~none], axis=1)
     variances = directions**2 / np.maximum(signal, 1)
     adds = np.sum(variances[:, ~none & ~told], axis=1)
-    unknown = (moves > np.minimum(_SHARE, _CHANCE * chance + _EXACT)) | (
-        adds > _SHARE * np.sum(variances[:, told], axis=1)
-    )
+    most = np.minimum(_SHARE, _CHANCE * chance + _EXACT)
+    unknown = (moves > most) | (adds > _SHARE * np.sum(variances[:, told], axis=1))
     inner[unknown] = inner[:, unknown] = np.nan
     unit = known.scale[free]
     matrix[at] = inner * unit * unit[:, None]

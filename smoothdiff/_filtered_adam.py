@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Int, PyTree
 
+from smoothdiff._numbers import at_least_float32
 from smoothdiff._params import is_concrete
 from smoothdiff.filters.grid import Filter, Scale
 
@@ -116,16 +117,19 @@ def scale_by_filtered_adam(
         raise ValueError(f'second_moment={second_moment!r} must be "filter", "max" or "none"')
     keep_m, keep_v = _remembers(b1), second_moment != "none" and _remembers(b2)
 
+    zeros = lambda x: jnp.zeros_like(at_least_float32(x))
+
     def init(params: Any) -> Any:
         return FilteredAdamState(
             step=jnp.zeros((), jnp.int32) if keep_m or keep_v else None,
-            m=jax.tree.map(jnp.zeros_like, _fine(params)) if keep_m else None,
-            v=jax.tree.map(jnp.zeros_like, _fine(params)) if keep_v else None,
+            m=jax.tree.map(zeros, params) if keep_m else None,
+            v=jax.tree.map(zeros, params) if keep_v else None,
         )
 
     def update(updates: Any, state: Any, params: Any = None, **extra_args: Any) -> tuple[Any, Any]:
         step: Any = optax.safe_increment(state.step) if keep_m or keep_v else None
-        given, updates, params = updates, _fine(updates), _fine(params)
+        given, fine = updates, lambda tree: jax.tree.map(at_least_float32, tree)
+        updates, params = fine(updates), fine(params)
         g = _filtered(prefilter, updates, params)
         m = _average(b1, g, state.m) if keep_m else g
         scaled = _filtered(postfilter, m, params)
@@ -145,7 +149,7 @@ def scale_by_filtered_adam(
             scaled = jax.tree.map(
                 lambda m, v: m / (jnp.sqrt(jnp.abs(v)) + _scalar(eps, m)), scaled, bound
             )
-        scaled = jax.tree.map(lambda new, like: new.astype(like.dtype), scaled, given)
+        scaled = jax.tree.map(lambda new, like: new.astype(jnp.asarray(like).dtype), scaled, given)
         return scaled, FilteredAdamState(step, m if keep_m else None, v if keep_v else None)
 
     return optax.GradientTransformationExtraArgs(init, update)
@@ -203,16 +207,6 @@ def filtered_adam(
         scale_by_filtered_adam(b1, b2, eps, prefilter, postfilter, second_moment),
         optax.scale_by_learning_rate(learning_rate),
     )
-
-
-def _fine(tree: PyTree) -> PyTree:
-    """In float32 at least: a decay of 0.999 is one in bfloat16, an eps of 1e-8 zero in float16."""
-
-    def fine(x: Array) -> Array:
-        coarse = jnp.issubdtype(x.dtype, jnp.floating) and jnp.finfo(x.dtype).bits < 32
-        return x.astype(jnp.float32) if coarse else x
-
-    return jax.tree.map(fine, tree)
 
 
 def _filtered(filter: Filter | None, tree: PyTree, params: PyTree) -> PyTree:

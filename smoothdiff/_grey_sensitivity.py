@@ -66,7 +66,10 @@ class Sensitivity(eqx.Module):
 
     @eqx.filter_jit
     def counts(self) -> Float[Array, " n"]:
-        """What each parameter counts: the root, one in the mean; one while nothing is known."""
+        """How much each parameter counts: the root of its s, with a mean of one.
+
+        All count alike while nothing is known.
+        """
         pairs = jnp.sum(self.pairs)
         usual = jnp.sum(self.total) / jnp.where(pairs > 0, pairs, 1)
         usual = jnp.where(usual > 0, usual, 1)

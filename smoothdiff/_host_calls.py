@@ -8,6 +8,7 @@ import contextlib
 import dataclasses
 import logging
 import os
+import threading
 import traceback
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -173,7 +174,9 @@ class HostFunction:
 
     def _outcomes(self, samples: Samples, late: Callable[[int | None, Any], None]) -> Outcomes:
         which = [None] if self.batched else range(len(samples))
-        rest = self.retries, self.timeout, late
+        # threads cannot wait longer, so a longer timeout is no limit
+        endless = self.timeout is None or self.timeout >= threading.TIMEOUT_MAX
+        rest = self.retries, None if endless else self.timeout, late
         try:
             yield from self.engine.outcomes(self.fun, samples, which, *rest)
         except PoolLostError as lost:

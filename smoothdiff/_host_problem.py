@@ -18,7 +18,7 @@ from smoothdiff._flat import Flat
 from smoothdiff._host_function import evaluator, rows_at, traced
 from smoothdiff._host_steps import HostSteps
 from smoothdiff._known import Known
-from smoothdiff._layout import Layout, layout_of
+from smoothdiff._layout import Layout, layout_of, vectors
 from smoothdiff._problem import Problem, Trial
 from smoothdiff._programs import is_short, jit_quickly
 from smoothdiff._solvers import Progress
@@ -143,7 +143,7 @@ class HostProblem(Problem):
         """The lowest point once more."""
         contest = self.host.contest(y, state)
         lowest, before = contest.each - 1, contest.progress.lowest_fun
-        again = self._funs(y, _vectors(contest.points)[lowest : lowest + 1], 0)
+        again = self._funs(y, vectors(contest.points)[lowest : lowest + 1], 0)
         with _extremes():
             return Trial(again, bool(~np.isfinite(before) | differ(again[0], before)))
 
@@ -152,7 +152,7 @@ class HostProblem(Problem):
     ) -> tuple[PyTree, dict[str, Any]]:
         """With a loop on the host, where the function is called by the program that it has."""
         contest = self.host.contest(y, state, takes_key(self.options))
-        points, each, found, done = _vectors(contest.points), contest.each, contest.unknown(), 0
+        points, each, found, done = vectors(contest.points), contest.each, contest.unknown(), 0
         constant = trial is not None and not trial.noisy
         # in the first round the lowest point comes last, whose value a trial may have told
         told = np.empty(0, found.dtype) if trial is None or constant else trial.fun
@@ -221,9 +221,3 @@ class HostProblem(Problem):
 # what NumPy would warn of: values that are infinite, or whose difference is
 _extremes = functools.partial(np.errstate, invalid="ignore", over="ignore")
 _objectives = jit_quickly(objectives, static_argnums=1)
-
-
-def _vectors(points: PyTree[np.ndarray]) -> Float[np.ndarray, "m n"]:
-    """Stacked points as vectors."""
-    leaves = [leaf.reshape(len(leaf), -1) for leaf in jax.tree.leaves(points)]
-    return np.concatenate(leaves, axis=1)

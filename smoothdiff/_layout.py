@@ -72,3 +72,10 @@ def layout_of(y: PyTree[Array]) -> Layout:
     leaves, treedef = jax.tree.flatten(y)
     shapes, dtypes = tuple(x.shape for x in leaves), tuple(x.dtype for x in leaves)
     return Layout(treedef, shapes, dtypes, (True,) * len(leaves))
+
+
+def vectors(points: PyTree[np.ndarray]) -> np.ndarray:
+    """Stacked points as vectors, one in each row."""
+    leaves = jax.tree.leaves(points)
+    flat = [np.reshape(leaf, (len(leaf), math.prod(leaf.shape[1:]))) for leaf in leaves]
+    return np.concatenate(flat, axis=1)

@@ -14,6 +14,10 @@ from smoothdiff._solvers import AbstractSmoothSolver
 _EVALUATIONS, _STEPS = 200, 256
 
 
+class NoRoomError(ValueError):
+    """A limit that leaves no room for a step."""
+
+
 class Limits(NamedTuple):
     """The most steps, seconds, and evaluations after which there is still room for a step.
 
@@ -56,7 +60,7 @@ class Limits(NamedTuple):
             return Limits(steps, None, seconds, goal, steps)
         room = evaluations - final - step
         if room < 0:
-            raise ValueError(
+            raise NoRoomError(
                 f"max_evaluations={max_evaluations} leaves no room: a step takes {step}, judging "
                 f"the result {final}. Allow {step + final}, or lower the solver's num_samples"
             )

@@ -1,7 +1,6 @@
 """The errors of least-squares parameters in natural values, from the evaluations of a run."""
 
 import dataclasses
-import math
 import warnings
 from typing import NamedTuple
 
@@ -11,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from smoothdiff._covariance import Covariance, covariance, slopes
-from smoothdiff._layout import layout_of
+from smoothdiff._layout import layout_of, vectors
 from smoothdiff._params import side_leaves
 from smoothdiff._solvers._history import History
 from smoothdiff._unit_space import UnitSpace
@@ -37,12 +36,6 @@ class Answer(NamedTuple):
         high = layout.vector(side_leaves(high, np.inf, self.y))
         return np.asarray(low), np.asarray(high)
 
-    def _rounded(self, points: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m n"]:
-        """As the function saw them, where leaves have other dtypes than the vector."""
-        leaves = jax.tree.leaves(layout_of(self.y).tree(points))
-        flat = [np.reshape(leaf, (len(points), math.prod(leaf.shape[1:]))) for leaf in leaves]
-        return np.concatenate(flat, axis=1)
-
     def with_rows(self, points: Float[np.ndarray, "m n"], rows: Float[Array, "m P"]) -> "Answer":
         """With the residuals at further points; those that are not finite are left out."""
         values = np.asarray(rows)
@@ -55,7 +48,9 @@ class Answer(NamedTuple):
         points, rows = np.asarray(history.points)[valid], np.asarray(history.rows)[valid]
         points = np.concatenate([points, *(point for point, _ in self.more)])
         rows = np.concatenate([rows, *(row for _, row in self.more)])
-        here = np.flatnonzero(np.all(self._rounded(points) == self.vector(), axis=1))
+        # as the function saw them, where leaves have other dtypes than the vector
+        seen = vectors(layout_of(self.y).tree(points))
+        here = np.flatnonzero(np.all(seen == self.vector(), axis=1))
         return points, rows, int(here[-1]) if len(here) else None
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, PyTree
 from smoothdiff._layout import Layout
 from smoothdiff._numbers import check_real, check_whole
 
-# raw keys, by how many words they have
+# raw keys that are not of the default kind, by how many words they have
 _KINDS = {2: "threefry2x32", 4: "rbg"}
 
 
@@ -47,7 +47,8 @@ def _typed(key: Any, advice: str) -> Array:
         if key.ndim == 0:
             return key
     elif dtype == jnp.uint32 and key.ndim == 1 and key.size in _KINDS:
-        return jax.random.wrap_key_data(key, impl=_KINDS[key.size])
+        usual = jax.eval_shape(lambda: jax.random.PRNGKey(0)).size
+        return jax.random.wrap_key_data(key, impl=None if key.size == usual else _KINDS[key.size])
     raise TypeError(advice)
 
 

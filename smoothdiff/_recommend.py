@@ -17,9 +17,9 @@ from smoothdiff._flat import Flat
 from smoothdiff._host_function import evaluator, rows_at
 from smoothdiff._limits import Limits
 from smoothdiff._look_around import WIDEST, View, look_around
+from smoothdiff._numbers import inexact
 from smoothdiff._params import as_key, take_apart
 from smoothdiff._reraise import reraise
-from smoothdiff._run import inexact
 from smoothdiff._solvers._base import write_options
 from smoothdiff._solvers._evaluator import called
 from smoothdiff._solvers._random_numbers import in_step, keyed
@@ -206,10 +206,8 @@ def _words(view: View, names: list[str], squares: bool, n: int) -> tuple[list[st
     """What was seen, and what to try."""
     seen, advice, effects = [], [], view.effects
     if not view.finite:
-        advice = (
-            "another y0, unless the function is finite around this one: then a search can begin"
-        )
-        return ["the function is not finite at y0"], [advice]
+        other = "another y0, unless the function is finite around this one: then a search can begin"
+        return ["the function is not finite at y0"], [other]
     known = effects > _SEEN * view.noise
     if view.noise:
         beside = f"beside changes of {np.max(effects):.2g} within sigma"

@@ -84,10 +84,10 @@ class Result:
             errors of parameters are `parameter_errors`.
         evaluations: evaluations of the function, the judgement included; not those of a step that
             was broken off.
-        reason: why the run stopped. A limit: "target", "max_steps", "max_evaluations",
-            "max_seconds", "callback", "interrupted". Or the solver: "converged"; "stalled", after
-            too many evaluations that hardly lowered it; "noise", where nothing but noise is left.
-            In an error: "nonfinite" or "failed".
+        reason: why the run stopped. A limit: "target", also where the last judgement found it,
+            "max_steps", "max_evaluations", "max_seconds", "callback", "interrupted". Or the solver:
+            "converged"; "stalled", after too many evaluations that hardly lowered it; "noise",
+            where nothing but noise is left. In an error: "nonfinite" or "failed".
         history: one `Record` for each step, with the iterates if `keep_iterates` says so.
         solver: the solver, also where none was given.
         state: its last state.

@@ -214,12 +214,11 @@ class Run:
         return isinstance(self._ours(), optx.AbstractLeastSquaresSolver)
 
     def _nonfinite(self, progress: Progress | None = None, overflowed=False) -> MinimiseError:
-        sigma, step = getattr(self._ours(), "sigma", None), self.steps
-        width = sigma(step) if callable(sigma) else None
-        if not all(np.all(np.asarray(leaf) > 0) for leaf in jax.tree.leaves(width)):
-            advice = f"sigma of step {step} is {width}: end its schedule above zero"
-            return MinimiseError(_NONFINITE + advice, self.found("nonfinite", progress))
         advice = _ADVICE[getattr(self._ours(), "nonfinite", "propagate")]
+        if callable(sigma := getattr(self._ours(), "sigma", None)):
+            width = sigma(self.steps)
+            if not all(np.all(np.asarray(leaf) > 0) for leaf in jax.tree.leaves(width)):
+                advice = f"sigma of step {self.steps} is {width}: it must stay above zero"
         dtype = self.state.progress.lowest_fun.dtype
         if overflowed and self._is_of_residuals() and jnp.finfo(dtype).bits < 64:
             advice += _OVERFLOW.format(dtype)
@@ -257,12 +256,6 @@ class Run:
             answer=Answer(y, self.units, self.problem.options.get("bounds")),
             **numbers,
         )
-
-
-def inexact(leaf: Any) -> Array:
-    leaf = jnp.asarray(leaf)
-    # a dtype that is given is no weak type, for which everything would be compiled once more
-    return leaf.astype(leaf.dtype if jnp.issubdtype(leaf.dtype, jnp.inexact) else float)
 
 
 def _of_jax(leaf: Any) -> Any:

@@ -17,7 +17,7 @@ from smoothdiff._numbers import check_whole
 from smoothdiff._params import as_key
 from smoothdiff._solvers import AbstractSmoothSolver
 from smoothdiff._solvers._base import write_options
-from smoothdiff._solvers._box import bounds_of, closed
+from smoothdiff._solvers._box import bounds_of, has_box
 from smoothdiff._solvers._stages import LOOK, TRUST
 from smoothdiff._told import Told
 
@@ -25,8 +25,6 @@ from smoothdiff._told import Told
 _LOST, _SOME = 2, 4
 # two programs may give the same point with so many roundings between
 _ROUNDINGS = 8
-# after so many points with natural values that are out there may be no others
-_REPEATS = 256
 # so many points of no model are near the iterate
 _NEARBY = 16
 
@@ -166,8 +164,7 @@ class Search:
     def ask(self, count: int = 1) -> list[PyTree[np.ndarray]]:
         """The next points to evaluate, so many of them.
 
-        They differ from all that are out. Of whole numbers there may be no others: then some come
-        again.
+        They differ from all that are out, unless all whole numbers are.
 
         Raises:
             TypeError, ValueError: a count that is not whole, or negative.
@@ -179,22 +176,21 @@ class Search:
         self._out = {name: out for name, out in self._out.items() if out.before > late}
         out = {vector.tobytes() for vector in self._vectors_out()}
         wanted = self._wanted(count + len(out)) if count else iter(())
-        given: list[PyTree] = []
-        repeats = 0
+        units, given = self._told.units, list[PyTree]()
+        grid = None if units is None else units.count()
         while len(given) < count:
             vector, asked = next(wanted)
-            if (unit := vector.tobytes()) in out or unit in self._came:
-                repeats += 1
-                if repeats <= _REPEATS:
-                    continue
+            known = (unit := vector.tobytes()) in out or unit in self._came
+            full = grid is not None and len(self._out) >= grid
+            if known and not full:
+                continue
             out.add(unit)
             point = jax.device_get(self._told.natural(self._told.layout.tree(jnp.asarray(vector))))
-            same = self._out.get(_bytes(point))
-            if same is None:
-                self._out[_bytes(point)], repeats = _Out([vector], self.evaluations), 0
-            elif asked:
+            if (same := self._out.get(_bytes(point))) is None:
+                self._out[_bytes(point)] = _Out([vector], self.evaluations)
+            elif asked and not known:
                 same.vectors.append(vector)  # the value will be that of both
-            if same is None or (repeats := repeats + 1) > _REPEATS:
+            if same is None or full:
                 given.append(point)
         return given
 
@@ -214,18 +210,22 @@ class Search:
             self._out[name].vectors if name in self._out else [self._within(point)]
             for name, point in zip(names, points, strict=True)
         ]
-        known = told.size
-        rows = told.rows(values, finite=self.solver.nonfinite == "propagate")
-        if known is None and (size := told.size or 1) > 1:
-            self._state = self._first(size)
-            # these failed
-            self._came = {u: (v, np.resize(row, size)) for u, (v, row) in self._came.items()}
+        size, rows = told.rows(values, finite=self.solver.nonfinite == "propagate")
+        if told.size is None and size is not None:
+            self._sized(size)
         for name, alike, row in zip(names, vectors, rows, strict=True):
             told.counted(alike[0], row)
-            # of two values for one point the second is of the first vector alone
+            # if a point is told twice in one call, only its first vector gets the second value
             for vector in alike if self._out.pop(name, None) else alike[:1]:
                 self._take(vector, row)
         self._digest()
+
+    def _sized(self, size: int) -> None:
+        """Of so many numbers is a row, it is known now; what came before had failed."""
+        if size > 1:
+            self._state = self._first(size)
+            self._came = {u: (v, np.resize(row, size)) for u, (v, row) in self._came.items()}
+        self._told.size = size
 
     def _take(self, vector: np.ndarray, row: np.ndarray) -> None:
         """Keeps a row until it is asked for; one that the same point had before is learnt."""
@@ -294,7 +294,7 @@ class Search:
         # so wide that there are other points, where a radius has come to nothing
         least = np.sqrt(np.finfo(here.dtype).eps) * np.maximum(sigma, np.abs(here))
         width = np.maximum(sigma * np.asarray(search.width()), least)
-        box = params.low is not None and bool(closed(params))
+        box = bool(has_box(params))
         for k in itertools.count():
             # whole numbers nearby may all be out
             if box and k >= _NEARBY:

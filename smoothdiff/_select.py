@@ -72,7 +72,8 @@ def select(
 
     Raises:
         ValueError: no candidates; fewer than two points to fit or to judge by; points and values
-            that differ in number; a value that is not finite.
+            that differ in number; points that are no rows; what is not finite.
+        TypeError: complex numbers.
 
     Example:
         >>> import functools, jax, jax.numpy as jnp

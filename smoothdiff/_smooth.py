@@ -48,7 +48,8 @@ def smooth(
         argnums, ..., stderr: see `Options`, which describes them for all transforms.
 
     Returns:
-        `g(key, *args)`: the smoothed value, shaped like the output of `fun`; with `has_aux` the
+        `g(key, *args)`: the smoothed value, shaped like the output of `fun`, in float32 at least;
+        with `has_aux` the
         pair of it and aux, with `stderr=True` the pair of that and standard errors.
 
     Raises:

@@ -17,9 +17,10 @@ from smoothdiff._host_problem import HostProblem
 from smoothdiff._host_samples import BlackBoxError
 from smoothdiff._known import Known
 from smoothdiff._limits import Limits
+from smoothdiff._numbers import inexact
 from smoothdiff._problem import Problem
 from smoothdiff._result import Record, Result
-from smoothdiff._run import Run, inexact
+from smoothdiff._run import Run
 from smoothdiff._solvers import AbstractSmoothSolver
 from smoothdiff._solvers._base import write_options
 from smoothdiff._solvers._evaluator import called

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PyTree
 
+from smoothdiff._numbers import floating
 from smoothdiff._params import as_first_key, take_apart
 
 
@@ -135,9 +136,9 @@ def matrix_support(matrix: Any, shape: tuple[int, ...] | None = None) -> MatrixS
     """The support that a sparse matrix says.
 
     Args:
-        matrix: a scipy sparse matrix, or a dense array, with a row for each term and a column for
-            each smoothed parameter, in the order of `jax.flatten_util.ravel_pytree`; its non-zero
-            entries are where a parameter may influence a term.
+        matrix: a scipy sparse matrix, or a dense array or lists, with a row for each term and a
+            column for each smoothed parameter, in the order of `jax.flatten_util.ravel_pytree`; its
+            non-zero entries are where a parameter may influence a term.
         shape: the shape of the terms; None for a vector.
 
     Returns:
@@ -179,7 +180,7 @@ def moving_support(around: Callable[[PyTree], Callable[[PyTree], Array]]) -> Mov
         For the option `support`. It is no linear function itself: `.at(params)` is.
 
     Raises:
-        TypeError: `around` is no function.
+        TypeError: `around` is no function; when it is called, what it returns is none.
 
     Example:
         >>> import jax, jax.numpy as jnp, smoothdiff as sd
@@ -261,7 +262,7 @@ def probe_support(
         z = jnp.where(moved, jax.random.normal(move, (probes, n), params.theta.dtype), 0)
         points = params.theta[None] + params.sigma[None] * jnp.concatenate([0 * z[:1], z])
         terms = jax.vmap(lambda t: fun(params.layout.tree(t, params.free), *args))(points)
-        terms = terms.astype(float) if terms.dtype == bool else terms
+        terms = floating(terms)
         near = jnp.abs(terms[1:] - terms[:1]) <= atol
         # infinite or NaN in both
         same = (terms[1:] == terms[:1]) | (jnp.isnan(terms[1:]) & jnp.isnan(terms[:1]))

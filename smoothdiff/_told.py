@@ -9,8 +9,7 @@ from jaxtyping import Array, Float, PyTree
 
 from smoothdiff._call_checks import check_squares
 from smoothdiff._layout import layout_of
-from smoothdiff._numbers import check_real
-from smoothdiff._run import inexact
+from smoothdiff._numbers import check_real, inexact
 from smoothdiff._unit_space import UnitSpace
 
 
@@ -58,8 +57,10 @@ class Told:
             UnitSpace.of(point, self._space)
         return np.asarray(self.layout.vector(jax.tree.leaves(self.unit(point))))
 
-    def rows(self, values: Sequence[Any], finite: bool) -> list[Float[np.ndarray, " P"]]:
-        """The values as rows of one size, which is known from now on; NaN where one failed.
+    def rows(
+        self, values: Sequence[Any], finite: bool
+    ) -> tuple[int | None, list[Float[np.ndarray, " P"]]]:
+        """How many numbers a row has, if that is known now; and the rows, NaN where one failed.
 
         Raises:
             TypeError, ValueError: what is no value; one that is not finite, if all have to be.
@@ -82,8 +83,7 @@ class Told:
             raise ValueError('a value is not finite: give the solver nonfinite="drop"')
         if self._residuals and self.size is None and given:
             check_squares(given[0])
-        self.size = size
-        return [np.full(size or 1, np.nan, r.dtype) if _failed(r) else r for r in rows]
+        return size, [np.full(size or 1, np.nan, r.dtype) if _failed(r) else r for r in rows]
 
     def counted(self, vector: Float[np.ndarray, " n"], row: Float[np.ndarray, " P"]) -> None:
         """With a value more."""

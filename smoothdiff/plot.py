@@ -202,7 +202,8 @@ def errors(
 
     Raises:
         ValueError: another number of standard errors or labels than of values; parameters without
-            standard errors, or a result that has none.
+            standard errors, or a result that has none; standard errors of another structure, or
+            negative ones.
 
     Example:
         >>> import matplotlib.figure, smoothdiff as sd

@@ -331,11 +331,15 @@ def test_a_center_that_is_not_finite_is_dropped_too():
     assert np.all(np.isfinite(grad))
 
 
-@pytest.mark.parametrize("impl", ["threefry2x32", "rbg"])
+@pytest.mark.parametrize("impl", ["threefry2x32", "rbg", "unsafe_rbg"])
 def test_raw_keys_are_those_of_their_kind(impl):
-    grad, key = sd.smooth_grad(jnp.sum, 0.5), jax.random.key(3, impl=impl)
-    x = jnp.ones(2)
-    np.testing.assert_array_equal(grad(jax.random.key_data(key), x), grad(key, x))
+    """Of keys of one length those of the default kind."""
+    grad, x = sd.smooth_grad(jnp.sum, 0.5), jnp.ones(2)
+    with jax.default_prng_impl(impl):
+        np.testing.assert_array_equal(grad(jax.random.PRNGKey(3), x), grad(jax.random.key(3), x))
+    if impl != "unsafe_rbg":
+        key = jax.random.key(3, impl=impl)
+        np.testing.assert_array_equal(grad(jax.random.key_data(key), x), grad(key, x))
 
 
 def test_argnums_may_be_numbers_of_numpy():

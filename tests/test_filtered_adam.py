@@ -316,3 +316,9 @@ def test_it_descends_on_sampled_gradients_of_a_function_with_steps():
             error(filtered_adam(0.03, 0.2, 0.36, postfilter=f)) for f in (None, filter)
         )
     assert filtered < 0.5 * plain
+
+
+def test_parameters_may_be_numbers_of_python():
+    optim = filtered_adam(0.1)
+    updates, _ = optim.update({"a": jnp.ones(())}, optim.init({"a": 0.0}), {"a": 0.0})
+    np.testing.assert_allclose(updates["a"], -0.1, rtol=1e-5)

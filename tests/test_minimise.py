@@ -384,7 +384,7 @@ def test_an_error_in_the_callback_is_the_callers():
 
 def test_a_schedule_that_reaches_zero_is_blamed():
     solver = sd.FirstOrder(optax.adam(0.05), optax.linear_schedule(0.3, 0.0, 6))
-    with pytest.raises(sd.MinimiseError, match=r"sigma of step 6 is 0\.0: end its schedule above"):
+    with pytest.raises(sd.MinimiseError, match=r"sigma of step 6 is 0\.0: it must stay above zero"):
         sd.minimise(waves, Y0, TARGET, key=KEY, solver=solver, max_steps=20)
 
 

@@ -99,6 +99,10 @@ def test_a_change_to_nan_and_of_a_switch_is_one():
             jax.random.key(0), jnp.zeros(5)
         )
         assert sorted(support.params.tolist()) == everywhere
+    # unsigned numbers do not wrap around
+    counts = lambda x: (10 + jnp.sign(x)).astype(jnp.uint8)
+    still = sd.probe_support(counts, 1.0, num_samples=100, reach=1, atol=1.5)
+    assert still(jax.random.key(0), jnp.zeros(5)).params.tolist() == []
     # what is NaN before and after stands still
     hole = lambda x: jnp.where(jnp.arange(5) == 2, jnp.nan, jnp.round(4 * x))
     probe = sd.probe_support(hole, 1.0, num_samples=100, reach=1)

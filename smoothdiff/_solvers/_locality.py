@@ -14,6 +14,7 @@ from smoothdiff._estimate import combine
 from smoothdiff._named_baselines import as_baseline
 from smoothdiff._params import Params, is_concrete, take_apart
 from smoothdiff._samplers import AbstractSampler
+from smoothdiff._solvers._box import bounds_of
 from smoothdiff._stderr import value_stderr
 
 # the width of the smoothing kernel, in units of that of the locality
@@ -125,6 +126,5 @@ def check_box(params: Params) -> None:
 
 def _within(params: Params, share_of: Array) -> Array:
     """The point at these shares of the way from the lower to the upper bounds."""
-    assert params.low is not None
-    assert params.high is not None
-    return params.low + (params.high - params.low) * share_of
+    low, high = bounds_of(params)
+    return low + (high - low) * share_of

@@ -160,7 +160,8 @@ def laplacian(lam: Scale, *, ndim: int, power: int | float = 1) -> Filter:
     transforms diagonalise it exactly.
 
     Args:
-        lam: strength λ, at least 0 and finite; smooths over about sqrt(λ) pixels. May be traced.
+        lam: strength λ, at least 0 and finite; smooths over about sqrt(λ) pixels. May be traced;
+            then a negative one gives NaN.
         ndim: number of spatial axes: 1, 2 or 3.
         power: the exponent p.
 

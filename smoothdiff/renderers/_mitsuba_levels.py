@@ -5,6 +5,7 @@ import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
@@ -34,7 +35,8 @@ def levels(
     The finest level has the pixels of the photograph, with `spp` samples each. Each coarser level
     has half as many pixels along a side, and a quarter of the samples of a pixel, but no fewer than
     16 for a pixel (or `spp`, if less) and 1,024 for the picture. Its photograph has the means of
-    the pixels. The integrator stays the same, and the cost of a level is its number of samples.
+    the pixels. The integrator stays the same, and the cost of a level is its number of samples. A
+    coarse level that costs more than the finest is left out.
 
     Args:
         scene: as for `renderer`; the path of a file or a dict, as each level loads its own.
@@ -51,7 +53,8 @@ def levels(
         and take a key too, for `takes_key=True`: without one the noise of an image is fixed.
 
     Raises:
-        TypeError, ValueError: a photograph that is none; several sensors; as `renderer`.
+        TypeError, ValueError: a photograph that is none; several sensors; an `spp` that is no whole
+            number of 1 or more; as `renderer`.
 
     Example:
         >>> import jax, numpy as np, smoothdiff as sd
@@ -68,7 +71,7 @@ def levels(
     photo = np.asarray(photo)
     if photo.ndim != 3 or photo.shape[2] != 3:
         raise ValueError(f"photo must be of shape (height, width, 3), not {photo.shape}")
-    if photo.dtype.kind != "f" or not np.all(np.isfinite(photo)):
+    if not (jnp.issubdtype(photo.dtype, jnp.floating) and np.all(np.isfinite(photo))):
         raise ValueError("photo must be linear RGB: finite floating-point numbers, white is one")
     if np.ndim(options.get("sensor", 0)):
         raise ValueError("a photograph is of one sensor: give its number")
