@@ -96,6 +96,7 @@ def black_box(
             `out`.
         ValueError: If the options contradict each other; later, if the store is of another
             function.
+        OSError: When it runs, if the store cannot be opened.
 
     Example:
         >>> import jax, jax.numpy as jnp, numpy as np

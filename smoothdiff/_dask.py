@@ -136,6 +136,7 @@ class OnDask(AtOnce):
         again by then, and begins no other one: in the end it would have none, and calls would wait
         for ever.
         """
+        super()._glance()
         cluster = self._client.cluster
         wanted = getattr(cluster, "worker_spec", ())
         if len(getattr(cluster, "workers", wanted)) < len(wanted):

@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
+from smoothdiff._ctrl_c import raise_if_pressed
 from smoothdiff._host_samples import Samples
 from smoothdiff._outcomes import (
     FAULTS,
@@ -50,6 +51,7 @@ class InTurn:
         del timeout, late  # for executors
         line = deque((sample, 1) for sample in which)
         while line:
+            raise_if_pressed()
             sample, tries = line.popleft()
             try:
                 outcome = Outcome(sample, tries, fun(*samples.arguments(sample)), None)
@@ -79,8 +81,8 @@ class AtOnce:
 
     # whether the executor itself ends calls that take too long
     keeps_time = False
-    # seconds of waiting after which it is looked at, None for never
-    glances_every: Seconds = None
+    # seconds of waiting after which it is looked at
+    glances_every = 1.0
 
     def __init__(self, executor: Any):
         self._executor = executor
@@ -204,12 +206,11 @@ class AtOnce:
             if call.oldest_since is None:
                 call.oldest_since = now
             left = None if timeout is None else max(call.oldest_since + timeout - now, 0)
-            waits = [wait for wait in (left, self.glances_every) if wait is not None]
+            wait = self.glances_every if left is None else min(left, self.glances_every)
             try:
-                ticket = came.get(timeout=min(waits, default=None))
+                ticket = came.get(timeout=wait)
             except queue.Empty:
-                if self.glances_every is not None:
-                    self._glance()
+                self._glance()
                 if left is None:
                     continue
                 place, before = self._place(call.future), call.place
@@ -223,7 +224,8 @@ class AtOnce:
                     return ticket
 
     def _glance(self) -> None:
-        """Sees that the executor has what it needs, while nothing comes."""
+        """Sees that the executor has what it needs, and that all is wanted, while nothing comes."""
+        raise_if_pressed()
 
     def _submit(
         self, fun: Any, samples: Samples, which: list[int | None], timeout: Seconds

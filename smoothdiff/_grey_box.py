@@ -13,6 +13,7 @@ from jaxtyping import Array, ArrayLike, PyTree
 from tqdm import tqdm
 
 from smoothdiff._call_checks import explained
+from smoothdiff._ctrl_c import ctrl_c_noticed, is_ctrl_c, raise_if_pressed
 from smoothdiff._grey_cases import CaseSearches
 from smoothdiff._grey_lessons import Learner, Lessons
 from smoothdiff._grey_result import GreyBoxError, GreyRecord, GreyResult
@@ -178,21 +179,36 @@ def _loop(
     progress: bool,
 ) -> GreyResult:
     """Rounds until something ends them."""
-    try:
-        with tqdm(total=run.planned, initial=run.rounds, disable=not progress) as bar:
-            while (reason := _reached(run, target, max_seconds)) is None:
-                record = run.round()
-                bar.set_postfix_str(f"{record.evaluations} renders, loss {record.fun:.4g}", False)
-                bar.update()
-                if callback is not None and callback(record):
-                    return run.found("callback")
-        return run.found(reason)
-    except KeyboardInterrupt:
-        return run.found("interrupted")
-    except (BlackBoxError, jax.errors.JaxRuntimeError) as error:
-        raise GreyBoxError(str(error), run.found("failed")) from (error.__cause__ or error)
-    finally:
-        run.save()
+    with ctrl_c_noticed():
+        try:
+            return run.found(_ended(run, target, max_seconds, callback, progress))
+        except BaseException as error:
+            if is_ctrl_c(error):
+                return run.found("interrupted")
+            if isinstance(error, BlackBoxError | jax.errors.JaxRuntimeError):
+                raise GreyBoxError(str(error), run.found("failed")) from (error.__cause__ or error)
+            raise
+        finally:
+            run.save()
+
+
+def _ended(
+    run: GreyRun,
+    target: float | None,
+    max_seconds: float | None,
+    callback: Callable[[GreyRecord], Any] | None,
+    progress: bool,
+) -> str:
+    """Why there are no more rounds, after them."""
+    with tqdm(total=run.planned, initial=run.rounds, disable=not progress) as bar:
+        while (reason := _reached(run, target, max_seconds)) is None:
+            record = run.round()
+            raise_if_pressed()
+            bar.set_postfix_str(f"{record.evaluations} renders, loss {record.fun:.4g}", False)
+            bar.update()
+            if callback is not None and callback(record):
+                return "callback"
+    return reason
 
 
 def _reached(run: GreyRun, target: float | None, max_seconds: float | None) -> str | None:

@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from smoothdiff._black_box import UnknownOutputError
 from smoothdiff._call_checks import check_call, check_solver, explained
+from smoothdiff._ctrl_c import ctrl_c_noticed, is_ctrl_c, raise_if_pressed
 from smoothdiff._default_solver import default_solver, share_of_range
 from smoothdiff._host_problem import HostProblem
 from smoothdiff._host_samples import BlackBoxError
@@ -106,30 +107,39 @@ def solve(
             problem = HostProblem.of(fun, solver, args, options, y, known)
         problem, state = _begun(problem, y, kind.check)
     run = Run(problem, problem.here(y), state, units, _keeps(loop.keep_iterates, y))
-    try:
-        if loop.checkpoint is not None:
-            run.attach(loop.checkpoint)
-        with tqdm(total=ends.expected, initial=run.steps, disable=not loop.progress) as bar:
-            compiled = set()
-            while (reason := run.done() or run.reached(ends)) is None:
-                if (stage := problem.stage(run.state)) not in compiled:
-                    bar.set_description_str("compiling")
-                record = run.step()
-                compiled.add(stage)
-                bar.set_description_str(refresh=False)
-                text = f"{record.evaluations} evaluations, fun = {record.fun:.4g}"
-                bar.set_postfix_str(text, refresh=False)
-                bar.update()
-                if loop.callback is not None and loop.callback(record):
-                    reason = "callback"
-                    break
-        return run.judged(reason, ends.target)
-    except KeyboardInterrupt:
-        return run.found("interrupted")
-    except (BlackBoxError, jax.errors.JaxRuntimeError) as error:
-        raise run.failed(error) from (error.__cause__ or error)
-    finally:
-        run.save()
+    with ctrl_c_noticed():
+        try:
+            return _looped(run, loop, ends)
+        except BaseException as error:
+            if is_ctrl_c(error):
+                return run.found("interrupted")
+            if isinstance(error, BlackBoxError | jax.errors.JaxRuntimeError):
+                raise run.failed(error) from (error.__cause__ or error)
+            raise
+        finally:
+            run.save()
+
+
+def _looped(run: Run, loop: Loop, ends: Limits) -> Result:
+    """Steps until something ends them."""
+    if loop.checkpoint is not None:
+        run.attach(loop.checkpoint)
+    with tqdm(total=ends.expected, initial=run.steps, disable=not loop.progress) as bar:
+        compiled = set()
+        while (reason := run.done() or run.reached(ends)) is None:
+            if (stage := run.problem.stage(run.state)) not in compiled:
+                bar.set_description_str("compiling")
+            record = run.step()
+            raise_if_pressed()
+            compiled.add(stage)
+            bar.set_description_str(refresh=False)
+            text = f"{record.evaluations} evaluations, fun = {record.fun:.4g}"
+            bar.set_postfix_str(text, refresh=False)
+            bar.update()
+            if loop.callback is not None and loop.callback(record):
+                reason = "callback"
+                break
+    return run.judged(reason, ends.target)
 
 
 def _keeps(asked: bool | None, y: PyTree[Array]) -> bool:

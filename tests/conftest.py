@@ -8,6 +8,7 @@ import multiprocessing
 import multiprocessing.forkserver
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -195,3 +196,11 @@ def threads():
     """Two threads to call a black box on."""
     with concurrent.futures.ThreadPoolExecutor(2) as pool:
         yield pool
+
+
+@pytest.fixture
+def listens_to_ctrl_c():
+    """A shell that starts the tests in the background tells them to ignore Ctrl-C."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)

@@ -102,14 +102,6 @@ def test_reraise_in_threads_gives_each_its_own():
         ]
 
 
-@pytest.fixture
-def listens_to_ctrl_c():
-    """A shell that starts the tests in the background tells them to ignore Ctrl-C."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 def interrupted(x):
     signal.raise_signal(signal.SIGINT)
     return x

@@ -196,7 +196,8 @@ class Renderer:
             The image, linear RGB, or one for each camera if several were asked for.
 
         Raises:
-            ValueError: If a parameter is missing, unknown, or of the wrong shape.
+            ValueError: If a parameter is missing, unknown, or of the wrong shape, or a dict is
+                given where there is one parameter.
         """
         if self._single and isinstance(params, Mapping):
             raise ValueError(f"params is {next(iter(self._shapes))!r} alone: give an array")
