@@ -58,22 +58,26 @@ def look_around(
 
     Where nothing changes it goes on along the direction `further`, to both sides.
     """
-    base, again = rows(np.stack([here, here]))
+    twice = rows(np.stack([here, here]))
+    eps = float(np.finfo(twice.dtype).eps)
+    # the squares of float32 may be zero or infinite
+    base, again = twice.astype(float)
+    seen: Rows = lambda points: rows(points).astype(float)
     if not (np.all(np.isfinite(base)) and np.all(np.isfinite(again))):
         return View(False, 0.0, np.zeros((2, len(directions))), 0.0, None, 2)
-    least = _ROUNDING * float(np.finfo(base.dtype).eps * np.linalg.norm(base))
+    least = _ROUNDING * eps * float(np.linalg.norm(base))
     count, noise = 2, float(np.linalg.norm(again - base))
     if noise <= least:
         noise = 0.0
     else:
         # two values alone say little of how large it is
-        more = rows(np.stack([here, here]))
+        more = seen(np.stack([here, here]))
         deviations = np.std(np.stack([base, again, *more]), axis=0, ddof=1)
         count, noise = 4, float(np.sqrt(2) * np.linalg.norm(deviations))
 
     def look(steps: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         points = clip(here + steps * sigma)
-        out = rows(points)
+        out = seen(points)
         lengths = np.linalg.norm(out - base, axis=1)
         return points, out, np.where(np.isfinite(lengths), lengths, np.nan)
 
@@ -88,7 +92,7 @@ def look_around(
             count += 2
     if width and not noise:
         end = np.nanargmax(found)
-        jumps, more = _jumps(rows, (here, base), (points[end], out[end]), least)
+        jumps, more = _jumps(seen, (here, base), (points[end], out[end]), least)
         count += more
     return View(True, noise, changes, width, jumps, count)
 

@@ -4,10 +4,12 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
+from smoothdiff._params import is_concrete
 from smoothdiff._solvers._trust_region import truncated_cg
 
 
@@ -42,7 +44,7 @@ def newton_step(radius: PyTree) -> optax.GradientTransformationExtraArgs:
     Source: Steihaug 1983; Toint 1981. Second derivatives of the surrogate are named, and not used,
     in ZeroGrads (Fischer and Ritschel).
     """
-    if not all(jnp.all(jnp.asarray(r) > 0) for r in jax.tree.leaves(radius)):
+    if any(is_concrete(r) and not np.all(np.asarray(r) > 0) for r in jax.tree.leaves(radius)):
         raise ValueError(f"radius must be positive: {radius}")
 
     def init(params: PyTree) -> optax.EmptyState:
@@ -69,6 +71,7 @@ def newton_step(radius: PyTree) -> optax.GradientTransformationExtraArgs:
             params,
         )
         unit = ravel_pytree(widths)[0]
+        unit = jnp.where(unit > 0, unit, jnp.nan)  # one that is traced could not be checked
         # the step in units of the radius, so that the region is a ball
         slope = jax.grad(lambda d: value_fn(tree(flat + unit * d)))
         _, curvature = jax.linearize(slope, jnp.zeros_like(flat))

@@ -139,7 +139,7 @@ class Integer(AbstractSpace):
         low: the least number, or one for each number of the parameter.
         high: the largest number, itself included, likewise.
         sigma: the smoothing width as a share of the n intervals. By default as for `Range`, and at
-            least half an interval: within much less of its middle there is a single number.
+            least an interval, so that its neighbours are seen.
         label: a name for plots, such as "layers"; or one for each number of the parameter.
 
     Raises:
@@ -194,7 +194,7 @@ class Integer(AbstractSpace):
         return np.asarray(np.subtract(self.high, self.low) + 1)
 
     def _default_width(self, share: Any) -> Any:
-        return np.maximum(share, 0.5 / self.count())
+        return np.maximum(share, 1 / self.count())
 
     def _check_dtype(self, dtype: np.dtype, name: str) -> None:
         super()._check_dtype(dtype, name)

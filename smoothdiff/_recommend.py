@@ -226,7 +226,7 @@ def _words(view: View, names: list[str], squares: bool, n: int) -> tuple[list[st
     if view.width > 1:
         seen.append(f"a plateau: nothing changes within sigma, but {view.width:g} times as far")
         advice.append(f"this solver, whose sigma is {view.width:g} times the usual one")
-    elif not view.width:
+    elif not view.width and not np.all(np.isnan(view.changes)):
         seen.append(f"a plateau: nothing changes within {WIDEST:g} sigma")
         advice.append("another y0, a far larger sigma, or a look at whether fun uses y at all")
     elif not np.all(known | view.failed):

@@ -163,8 +163,11 @@ def smooth_hvp(
     compiled = compiled_once(product)
 
     def g(key: Any, x: PyTree, v: PyTree, *other_args: Any) -> PyTree:
-        call.params(key, (x, *other_args)).layout.check_vector(v)
-        return compiled(key, *jax.tree.map(jnp.asarray, (x, v)), *other_args)
+        args = (x, *other_args)
+        call.params(key, args).layout.check_vector(v)
+        target, v = jax.tree.map(jnp.asarray, (choose(args, call.argnums), v))
+        x, *other_args = replace(args, call.argnums, target)
+        return compiled(key, x, v, *other_args)
 
     return g
 

@@ -191,6 +191,8 @@ def laplacian(lam: Scale, *, ndim: int, power: int | float = 1) -> Filter:
     def filter(signal: Float[Array, "..."], guide: Float[Array, "..."]) -> Float[Array, "..."]:
         signal = floating(signal)
         _check_axes(signal, ndim)
+        if not signal.size:
+            return signal
         space, dtype = signal.shape[:ndim], signal.dtype
         # sums over all pixels could overflow, and so could the reciprocal of the largest number
         scaled = signal / 4

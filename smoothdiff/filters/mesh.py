@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from smoothdiff._numbers import floating
+from smoothdiff._numbers import at_least_float32, floating
 from smoothdiff._params import is_concrete
 from smoothdiff._products import dot
 from smoothdiff.filters._elimination import block_inverse
@@ -188,6 +188,11 @@ def _cotangent_solve(faces: np.ndarray, lam: int | float) -> Filter:
 
     def solve(signal: Array, guide: Any) -> Array:
         _check_positions(guide, signal)
+        dtype, signal = signal.dtype, at_least_float32(signal)
+        # the squares of its norm could overflow, or be zero
+        size = jax.lax.stop_gradient(jnp.max(jnp.abs(signal), axis=0, keepdims=True))
+        size = jnp.where(size > 0, size, 1)
+        signal = signal / size
         opposite = cotangents(guide, faces).astype(signal.dtype)
         weight = jnp.zeros((len(i), 1), signal.dtype).at[facing, 0].add(lam / 2 * opposite)
         diagonal = jnp.ones_like(signal[:, :1]).at[i].add(weight).at[j].add(weight)
@@ -199,7 +204,7 @@ def _cotangent_solve(faces: np.ndarray, lam: int | float) -> Filter:
         solution, _ = jax.scipy.sparse.linalg.cg(
             matrix, signal, tol=CG_TOLERANCE, maxiter=CG_STEPS, M=lambda h: h / diagonal
         )
-        return solution
+        return (solution * size).astype(dtype)
 
     return solve
 
