@@ -12,6 +12,8 @@ from smoothdiff._products import dot
 _LOWER = 0.8
 # numbers that differ by so many roundings are hardly told apart
 _HARDLY = 64
+# where there is no value, one is taken that is higher than the best by this share of a promise
+_BARRED = 0.1
 # the highest values may be beyond all measure: of those below, this quantile is a usual one
 _USUAL = 0.75
 
@@ -96,6 +98,24 @@ class History(eqx.Module):
         i = self._best()
         known = jnp.any(self.valid)
         return jnp.where(known, self.points[i], start), self.rows[i], self.funs[i]
+
+    def barred(
+        self,
+        row: Float[Array, " P"],
+        fun: Float[Array, ""],
+        promise: Float[Array, ""],
+        squares: bool,
+    ) -> "History":
+        """With values also where there are none, higher than the best one by a share of a promise.
+
+        So a model turns away from where the function has no value, and learns which ways are open.
+        If only the radius shrank, steps would end near the edge, wherever they meet it.
+        """
+        high = fun + _BARRED * jnp.maximum(promise, 0)
+        bars = ~self.valid & (high > fun)
+        larger = jnp.sqrt(high / jnp.where(bars, fun, 1))[:, None] * row[None] if squares else high
+        rows = jnp.where(bars[:, None], larger, self.rows)
+        return History(self.points, rows, jnp.where(bars, high, self.funs), self.valid | bars)
 
     def went_lower(self, other: "History") -> Bool[Array, ""]:
         """Whether the lowest value is lower than that of another history."""

@@ -202,7 +202,9 @@ class ResidualSearch(AbstractLookingSearch):
         """The search with these residuals at these points."""
         params = self._scaled(params)
         here = self.history.best(self.start)
-        with_rows = self.kept(new)
+        # what the radius learns of a step that failed is that it failed
+        barred = new.barred(here[1], here[2], jnp.max(proposal.reduction), squares=True)
+        with_rows = self.kept(where(self.is_local(), barred, new))
         branches = [
             lambda: with_rows._after_first(
                 params, jnp.where(new.valid, new.funs, jnp.inf)

@@ -90,7 +90,9 @@ class ValueSearch(ValueState):
         stage: int | None = None,
     ) -> "ValueSearch":
         """The search with these new evaluations."""
-        before = self.history.best(self.start)[2]
+        _, row, before = self.history.best(self.start)
+        barred = new.barred(row, before, jnp.max(proposal.reduction), squares=False)
+        new = where(self.is_local(), barred, new)
         known = self.kept(new)
         known = eqx.tree_at(lambda s: s.turn, known, self.turn.more(sizes.step))
 
