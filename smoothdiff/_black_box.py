@@ -258,8 +258,7 @@ class _Callback:
             self.host(samples, outs, self.out_tree)
             return [out.reshape(samples.batch_shape + out.shape[1:]) for out in outs]
         except BaseException as error:
-            was_raised(error)
-            raise
+            raise was_raised(error) from error.__cause__
 
 
 _X64 = (
