@@ -69,6 +69,15 @@ def digest_of(array: np.ndarray) -> bytes:
     return digest.digest()
 
 
+def custom_nodes(tree: Any) -> Iterator[tuple[type, Any]]:
+    """The nodes of a tree that are not of Python's types: each type, and its static data."""
+    node = tree.node_data()
+    if node is not None and node[0] not in (tuple, list, dict, type(None)):
+        yield node
+    for child in tree.children():
+        yield from custom_nodes(child)
+
+
 def _facts(name: str, value: Any, met: _Met) -> _Facts:
     """What makes up a value, each fact with the name of the part that it belongs to."""
     kind = type(value)
@@ -86,9 +95,12 @@ def _facts(name: str, value: Any, met: _Met) -> _Facts:
         yield part, " ".join([kind.__name__, *sorted(map(_whole, value))]).encode()
     elif kind is types.CodeType:
         yield from _code(name, value, met)
-    elif isinstance(value, types.ModuleType | jax.tree_util.PyTreeDef):
-        text = value.__name__ if isinstance(value, types.ModuleType) else _without_addresses(value)
-        yield name, text.encode()
+    elif isinstance(value, types.ModuleType):
+        yield name, value.__name__.encode()
+    elif isinstance(value, jax.tree_util.PyTreeDef):
+        yield name, _without_addresses(value).encode()
+        for node in custom_nodes(value):
+            yield from _facts(name, node, met)
     elif id(value) in met.objects:
         yield name, f"see {met.objects[id(value)][1]}".encode()
     else:

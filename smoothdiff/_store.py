@@ -167,8 +167,7 @@ class Store:
 
     def points(self, samples: Samples) -> list[str]:
         """What the samples are called here; the same for those that are the same point."""
-        which = range(len(samples))
-        return [_described(samples.leaves(i), samples.tree, samples.digest)[0] for i in which]
+        return [_point(samples, i)[0] for i in range(len(samples))]
 
     def find(self, points: Sequence[str]) -> list[Found | None]:
         """The values of the points that are there, else None."""
@@ -185,7 +184,7 @@ class Store:
 
     def put(self, samples: Samples, i: int, value: Sequence[np.ndarray], out_tree: Any) -> None:
         """Keeps the value of sample `i`, as leaves; it is on the disk when this returns."""
-        point, arrays = _described(samples.leaves(i), samples.tree, samples.digest)
+        point, arrays = _point(samples, i)
         text, more = _described(value, out_tree, digest_of)
 
         def write(file: sqlite3.Connection) -> None:
@@ -262,19 +261,26 @@ def _translated(path: Path) -> Iterator[None]:
         raise ValueError(f"{path} is not a store of evaluations: name another file") from error
 
 
+def _point(samples: Samples, i: int) -> tuple[str, dict[str, np.ndarray]]:
+    return _described(samples.leaves(i), samples.tree, samples.digest, samples.nodes)
+
+
 def _described(
-    leaves: Sequence[np.ndarray], tree: Any, digest: Callable[[np.ndarray], bytes]
+    leaves: Sequence[np.ndarray],
+    tree: Any,
+    digest: Callable[[np.ndarray], bytes],
+    nodes: dict[str, str] | None = None,
 ) -> tuple[str, dict[str, np.ndarray]]:
     """What arguments or a value are, as text that names the arrays, and these by name."""
     names = [digest(leaf).hex() for leaf in leaves]
     places = repr(tree.unflatten(range(len(names))))
-    text = json.dumps([re.sub(r" at 0x[0-9a-f]+", "", places), names])
-    return text, dict(zip(names, leaves, strict=True))
+    text = [re.sub(r" at 0x[0-9a-f]+", "", places), names, *([nodes] if nodes else [])]
+    return json.dumps(text), dict(zip(names, leaves, strict=True))
 
 
 def _read(file: sqlite3.Connection, text: str) -> Found:
     """What the text describes."""
-    places, names = json.loads(text)
+    places, names, *_ = json.loads(text)
     query = "select dtype, shape, data from arrays where id = ?"
     rows = (file.execute(query, (name,)).fetchone() for name in names)
     return Found([np.frombuffer(c, a).reshape(json.loads(b)) for a, b, c in rows], places)

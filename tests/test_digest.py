@@ -141,6 +141,11 @@ PAIRS = {
         lambda: Layer(jnp.ones(2), lambda y: -y),
         ["fun.act"],
     ),
+    "structure": (
+        lambda: jax.tree.structure({"a": Layer(jnp.ones(2), lambda y: y)}),
+        lambda: jax.tree.structure({"a": Layer(jnp.ones(2), lambda y: -y)}),
+        ["fun"],
+    ),
     "dataclass": (lambda: Settings(1.0), lambda: Settings(2.0), ["fun:width"]),
     "adam": (lambda: optax.adam(0.5), lambda: optax.adam(0.05), None),
     "schedule": (

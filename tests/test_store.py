@@ -7,8 +7,10 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import host_functions
 import jax
 import jax.numpy as jnp
@@ -133,6 +135,40 @@ def test_nodes_that_a_file_cannot_have(path):
         assert got == Pair(2.0, 2.0)
     assert len(host.calls) == 1
     assert sd.load_store(path) == [(tuple(Pair(1.0, 2.0)), tuple(Pair(2.0, 2.0)))]
+
+
+class Moded:
+    """An array and a setting, of which its text says nothing."""
+
+    def __init__(self, x, mode):
+        self.x, self.mode = x, mode
+
+    def __repr__(self):
+        return f"{self.x}"
+
+
+jax.tree_util.register_pytree_node(
+    Moded, lambda node: ((node.x,), node.mode), lambda mode, leaves: Moded(*leaves, mode)
+)
+
+
+class Curve(eqx.Module):
+    x: jax.Array
+    of: Callable = eqx.field(static=True)
+
+
+def test_arguments_that_differ_in_static_data_are_other_points(path):
+    calls, times = [], lambda k: lambda x: k * x
+    mode = lambda node: np.float32(calls.append(1) or node.x * node.mode)
+    function = lambda curve: np.float32(calls.append(1) or curve.of(curve.x))
+    other = path.with_name("other.db")
+    for paid in (4, 0):
+        calls.clear()
+        f, g = sd.black_box(mode, 0.0, store=path), sd.black_box(function, 0.0, store=other)
+        assert [float(f(Moded(1.0, k))) for k in (1, 2)] == [1.0, 2.0]
+        assert [float(g(Curve(jnp.ones(()), times(k)))) for k in (1, 2)] == [1.0, 2.0]
+        assert len(calls) == paid
+    assert len(sd.load_store(path)) == len(sd.load_store(other)) == 2
 
 
 def test_arguments_of_other_types_and_bits_are_other_points(path, x64):
