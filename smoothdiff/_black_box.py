@@ -80,7 +80,10 @@ def black_box(
             evaluated once. Neither errors nor NaN are kept, as their reason may be gone the next
             time: such a point is evaluated each time that it is asked for. Several processes
             may use the file; it is an SQLite database, so on a disk of this machine. It is of one
-            function, as checkpoints are. `smoothdiff.load_store` reads it.
+            function, as checkpoints are, and each batch sees whether it still is that one. If only
+            something that can change in place differs, such as an attribute, a warning says so,
+            and no values are added. Large NumPy arrays that `fun` closes over are read for that,
+            arrays of JAX only once. `smoothdiff.load_store` reads the file.
 
     Returns:
         A JAX function with the name and docstring of `fun`.

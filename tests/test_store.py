@@ -357,6 +357,56 @@ def test_what_calls_change_is_nothing_of_the_function(path):
     assert count == 2
 
 
+class Scaled:
+    """Has a setting that can change in place."""
+
+    def __init__(self, k):
+        self.k = k
+
+    def __call__(self, x):
+        return self.k * x
+
+
+def test_values_of_a_function_that_differs_are_not_added(path):
+    box = lambda k: sd.black_box(Scaled(k), 0.0, store=path)
+    assert box(2.0)(1.0) == 2.0
+    other = box(3.0)
+    with pytest.warns(RuntimeWarning, match=r"fun.k was another; .* none are added: name another"):
+        assert other(1.0) == 2.0
+    assert other(5.0) == 15.0
+    assert box(2.0)(5.0) == 10.0
+    assert stored(path) == {1.0: 2.0, 5.0: 10.0}
+
+
+def test_a_function_that_changes_between_calls_is_another(path):
+    k, scaled = 2.0, Scaled(2.0)
+    f = jax.jit(sd.black_box(lambda x: k * x, 0.0, store=path))
+    g = jax.jit(sd.black_box(scaled, 0.0, store=path.with_name("g.db")))
+    assert (awaited(f, 1.0), awaited(g, 1.0)) == (2.0, 2.0)
+    k = scaled.k = 3.0
+    with pytest.raises(ValueError, match=r"fun.k was another: name another file"):
+        awaited(f, 5.0)
+    with pytest.warns(RuntimeWarning, match=r"fun.k was another"):
+        assert awaited(g, 5.0) == 15.0
+    k = scaled.k = 2.0
+    assert (awaited(f, 5.0), awaited(g, 5.0)) == (10.0, 10.0)
+    assert stored(path) == stored(path.with_name("g.db")) == {1.0: 2.0, 5.0: 10.0}
+
+
+def test_a_late_change_by_the_calls_is_nothing_of_the_function(path):
+    fails, values = 0, []
+
+    def host(x):
+        nonlocal fails
+        fails += bool(x > 2)
+        return x
+
+    f = jax.jit(sd.black_box(host, 0.0, store=path))
+    for x in (1.0, 2.0, 3.0, 4.0):
+        values.append(awaited(f, x))
+    assert (values, fails, len(stored(path))) == ([1.0, 2.0, 3.0, 4.0], 2, 4)
+
+
 @pytest.mark.parametrize("content", [b"not a store at all" * 100, b"SQLite format 3"])
 def test_a_file_that_is_no_store(content, tmp_path):
     path = tmp_path / "notes.txt"
