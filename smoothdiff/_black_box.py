@@ -1,6 +1,5 @@
 """`black_box`: a host function of NumPy arrays as a JAX function, with faults that can be read."""
 
-import dataclasses
 import functools
 import os
 from collections.abc import Callable
@@ -11,13 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from smoothdiff._callbacks import Calls, jax_function
 from smoothdiff._executors import InTurn, engine
 from smoothdiff._host_calls import HostFunction
-from smoothdiff._host_samples import BlackBoxError, Samples, wait_for
+from smoothdiff._host_samples import BlackBoxError, Samples
 from smoothdiff._numbers import check_real, check_whole
 from smoothdiff._outputs import Outputs
 from smoothdiff._params import is_concrete
-from smoothdiff._reraise import reraise, was_raised
+from smoothdiff._reraise import reraise
 from smoothdiff._store import Store
 
 
@@ -150,66 +150,27 @@ def black_box(
     nan = on_error, on_nonfinite
     host = HostFunction(fun, name, batched, engine(executor), *nan, retries, timeout, kept)
     _check(host, store)
-    promised = None if out is None else _jax_function(host, Outputs.like(out))
-    found = _Found()
+    calls = Calls.of(host, out)
 
     @functools.wraps(fun)
     def box(*args):
-        if kept is not None:
-            kept.check()
+        if host.store is not None:
+            host.store.check()
         args = jax.tree.map(_array, args)
         leaves, tree = jax.tree.flatten(args)
         shapes = tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves)
-        call = promised or found.calls.get((tree, shapes))
+        call = calls.promised or calls.found.get((tree, shapes))
         if call is None:
             if not all(map(is_concrete, leaves)):
-                raise UnknownOutputError(_unknown(name, tree.unflatten(shapes)))
+                raise UnknownOutputError(_unknown(host.name, tree.unflatten(shapes)))
             result, outputs = _first(host, leaves, tree)
-            found.calls[tree, shapes] = _jax_function(host, outputs)
+            calls.found[tree, shapes] = jax_function(host, outputs)
             return result
         # Outside of jit the error is ours to raise; while jit traces, neither line does anything.
         with reraise():
             return jax.block_until_ready(call(*args))
 
     return box
-
-
-@dataclasses.dataclass
-class _Found:
-    """The JAX function for each structure of arguments that was met; says nothing of the values."""
-
-    calls: dict[Any, Callable[..., Any]] = dataclasses.field(default_factory=dict, compare=False)
-
-
-def _jax_function(host: HostFunction, outputs: Outputs) -> Callable[..., Any]:
-    """The host function, of which it is known what it returns, as a JAX function."""
-    for option in ("on_error", "on_nonfinite"):
-        if getattr(host, option) == "nan" and not outputs.have_nan():
-            raise ValueError(
-                f'{option}="nan" needs every output to be of floats, as integers have no NaN: '
-                f'return floats, or write {option}="raise"'
-            )
-
-    @jax.custom_jvp
-    def call(*args):
-        leaves, tree = jax.tree.flatten(args)
-        ndims, shapes = tuple(leaf.ndim for leaf in leaves), outputs.shapes()
-        callback = _Callback(host, tree, ndims, outputs.tree, shapes, _is_x64())
-        # Under vmap, however nested, one callback gets the whole batch.
-        results = jax.pure_callback(callback, shapes, *leaves, vmap_method="expand_dims")
-        return outputs.tree.unflatten(results)
-
-    # Only a tangent that arrives gets here; where the arguments are stopped, none does.
-    @call.defjvp
-    def no_derivative(primals, tangents):
-        raise TypeError(
-            f"the black box {host.name!r} has no derivative: smooth the function that calls it, "
-            "for example with sd.smooth(fun, sigma) or sd.smooth_grad(fun, sigma), "
-            "or stop the derivative with jax.lax.stop_gradient. A leaf whose sigma is None and "
-            'baseline="ad" need one, too'
-        )
-
-    return call
 
 
 def _first(host: HostFunction, leaves: list[jax.Array], tree: Any) -> tuple[PyTree, Outputs]:
@@ -238,42 +199,6 @@ def _unknown(name: str, args: tuple) -> str:
         f"call it once before, with arrays of these shapes; or write sd.black_box({name}, "
         "out=jax.ShapeDtypeStruct((), jnp.float32)) with the shape and dtype of what it returns"
     )
-
-
-@dataclasses.dataclass(frozen=True)
-class _Callback:
-    """What JAX calls. Equal for equal fields, so that calls outside of jit compile only once."""
-
-    host: HostFunction
-    tree: Any
-    ndims: tuple[int, ...]
-    out_tree: Any
-    shapes: tuple[jax.ShapeDtypeStruct, ...]
-    x64: bool
-
-    def __call__(self, *leaves: Any) -> list[np.ndarray]:
-        try:
-            if self.x64 and not _is_x64():  # JAX would round arguments to float32
-                raise BlackBoxError(_X64.format(self.host.name))
-            wait_for(leaves, self.host.name)
-            samples = Samples(leaves, self.ndims, self.tree)
-            outs = [np.empty((len(samples), *out.shape), out.dtype) for out in self.shapes]
-            self.host(samples, outs, self.out_tree)
-            return [out.reshape(samples.batch_shape + out.shape[1:]) for out in outs]
-        except BaseException as error:
-            raise was_raised(error) from error.__cause__
-
-
-_X64 = (
-    "the black box {!r} is part of a program in float64, but JAX calls it from another thread, and "
-    "jax.enable_x64(True) holds in one thread alone: write "
-    'jax.config.update("jax_enable_x64", True) instead, at the start of the program'
-)
-
-
-def _is_x64() -> bool:
-    """Whether float64 is on in this thread."""
-    return jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _array(leaf: Any) -> jax.Array:

@@ -93,7 +93,7 @@ class Samples:
         return [array[index] for array in self._arrays]
 
     @functools.cached_property
-    def nodes(self) -> dict[str, str]:
+    def nodes(self) -> dict[str, str | None]:
         """Digests of what the tree holds beside the arrays, which its text need not say."""
         return parts({"": self.tree}) if any(custom_nodes(self.tree)) else {}
 

@@ -246,7 +246,7 @@ def _described(
     leaves: Sequence[np.ndarray],
     tree: Any,
     digest: Callable[[np.ndarray], bytes],
-    nodes: dict[str, str] | None = None,
+    nodes: dict[str, str | None] | None = None,
 ) -> tuple[str, dict[str, np.ndarray]]:
     """What arguments or a value are, as text that names the arrays, and these by name."""
     names = [digest(leaf).hex() for leaf in leaves]

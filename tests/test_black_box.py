@@ -242,7 +242,7 @@ def test_arguments_that_never_arrive_raise_instead_of_hanging(monkeypatch):
     with pytest.raises(BlackBoxError, match=r"stairs: .* NPROC=2"):
         wait_for([np.ones(3), Slow(10**9)], "stairs", seconds=0.05)
     never = lambda leaves, name: wait_for([Slow(10**9)], name, seconds=0.05)
-    monkeypatch.setattr("smoothdiff._black_box.wait_for", never)
+    monkeypatch.setattr("smoothdiff._callbacks.wait_for", never)
     # no fault of the function, so that there is no NaN in place of it either
     f = black_box(stairs, SCALAR, on_error="nan")
     with pytest.raises(BlackBoxError, match="NPROC=2"), reraise():
@@ -259,9 +259,9 @@ def test_large_arguments_need_two_threads_of_jax(threads):
     script = """
 import functools, os
 import numpy as np, jax, jax.numpy as jnp, smoothdiff as sd
-from smoothdiff import _black_box
+from smoothdiff import _callbacks
 seconds = 3.0 if os.environ["NPROC"] == "1" else 60.0
-_black_box.wait_for = functools.partial(_black_box.wait_for, seconds=seconds)
+_callbacks.wait_for = functools.partial(_callbacks.wait_for, seconds=seconds)
 f = sd.black_box(lambda x: np.float32(x.mean()), jax.ShapeDtypeStruct((), jnp.float32))
 total = jax.jit(lambda xs: jnp.sum(jax.vmap(f)(xs)))
 xs = jnp.ones((8, 100_000))
