@@ -1,6 +1,7 @@
 """`black_box`: a host function of NumPy arrays as a JAX function, with faults that can be read."""
 
 import functools
+import inspect
 import os
 from collections.abc import Callable
 from typing import Any
@@ -49,7 +50,7 @@ def black_box(
 
     Args:
         fun: Called with positional arguments of the same structure as those of the JAX function,
-            their leaves read-only NumPy arrays.
+            their leaves read-only NumPy arrays. The JAX function also takes them by name.
         out: What `fun` returns: a `jax.ShapeDtypeStruct`, a pytree of them, or an example. For one
             sample, also when `batched`. 64-bit types are narrowed where JAX has them switched off.
             Floats are rounded to these types; any other change of a value raises. If left out, the
@@ -153,10 +154,11 @@ def black_box(
     calls = Calls.of(host, out)
 
     @functools.wraps(fun)
-    def box(*args):
+    def box(*args, **named):
         if host.store is not None:
             host.store.check()
-        args = jax.tree.map(_array, args)
+        args = _positional(host, args, named) if named else args
+        args = jax.tree.map(functools.partial(_array, host.name), args)
         leaves, tree = jax.tree.flatten(args)
         shapes = tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves)
         call = calls.promised or calls.found.get((tree, shapes))
@@ -201,8 +203,39 @@ def _unknown(name: str, args: tuple) -> str:
     )
 
 
-def _array(leaf: Any) -> jax.Array:
-    array = jnp.asarray(leaf)
+def _positional(host: HostFunction, args: tuple, named: dict[str, Any]) -> tuple:
+    """The arguments by their places, some of which were given by name."""
+    needs = f"the black box {host.name!r} takes arguments by their places"
+    try:
+        bound = inspect.signature(host.fun).bind(*args, **named)
+    except ValueError as error:  # as of functions in C
+        raise TypeError(f"{needs}, not by names such as {next(iter(named))!r}") from error
+    except TypeError as error:
+        raise TypeError(f"the black box {host.name!r}: {error}") from error
+    if bound.kwargs:  # what lies between has its default
+        bound.apply_defaults()
+    if bound.kwargs:
+        raise TypeError(
+            f"{needs}, and {', '.join(bound.kwargs)} can only be given by name: leave out the `*` "
+            "or `**` in its definition, or make the box of a lambda"
+        )
+    return bound.args
+
+
+def _array(name: str, leaf: Any) -> jax.Array:
+    try:
+        array = jnp.asarray(leaf)
+    except TypeError as error:
+        advice = ""
+        if hasattr(type(leaf), name):
+            advice = (
+                ". It is the `self` of a method: make the box of the bound method instead, as "
+                f"f = sd.black_box({type(leaf).__name__}(...).{name}), with the method as it was"
+            )
+        raise TypeError(
+            f"the black box {name!r} takes numbers, arrays and pytrees of them, not {leaf!r}"
+            f"{advice}"
+        ) from error
     if jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
         raise TypeError(
             "a host function cannot take a typed key: pass jax.random.key_data(key), or a seed"

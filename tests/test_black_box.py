@@ -53,6 +53,31 @@ def test_each_sample_is_evaluated_once_under_every_transform(way, batched, jit):
     assert counted.calls == (batches if batched else 6)
 
 
+def test_arguments_by_name():
+    box = black_box(lambda x, shift=0.5, scale=2.0: scale * (x + shift), 0.0)
+    assert box(x=1.0) == 3.0
+    assert box(1.0, scale=4.0) == 6.0
+    assert jax.jit(lambda x: box(scale=x, x=1.0, shift=1.0))(3.0) == 6.0
+    with pytest.raises(TypeError, match=r"black box '<lambda>': .*unexpected .*'size'"):
+        box(1.0, size=2.0)
+    with pytest.raises(TypeError, match="by their places, and scale can only be given by name"):
+        black_box(lambda x, *, scale: x, 0.0)(1.0, scale=2.0)
+    with pytest.raises(TypeError, match="by their places, not by names such as 'out'"):
+        black_box(max, 0.0)(1.0, out=2.0)
+
+
+def test_what_is_no_array_is_named_and_a_method_most_of_all():
+    class Simulator:
+        @black_box
+        def run(self, x):
+            return x
+
+    with pytest.raises(TypeError, match=r"(?s)'run' takes .*black_box\(Simulator\(\.\.\.\)\.run"):
+        Simulator().run(1.0)
+    with pytest.raises(TypeError, match=r"pytrees of them, not 'fast'$"):
+        black_box(lambda x, mode: x, 0.0)(1.0, "fast")
+
+
 def test_outside_of_vmap_a_batch_has_size_one():
     shapes = []
     box = black_box(
