@@ -63,7 +63,8 @@ def black_box(
         executor: Where single calls run, several at once, each result taken when it comes: a
             `concurrent.futures.Executor`, such as a `ThreadPoolExecutor`; `smoothdiff.Processes`,
             for functions that crash or hang; or the `distributed.Client` of a Dask cluster, for
-            many machines. Processes must be spawned, as a fork of JAX can hang.
+            many machines. Processes must be spawned, as a fork of JAX can hang, and import `fun` by
+            its name, which a decorator would take.
         on_error: "raise", or "nan" so that a sample for which `fun` raises an exception, calls
             `sys.exit`, loses its worker or runs out of time is NaN in every output (the whole batch
             if `batched`). `nonfinite="drop"` in the transforms then leaves it out. A wrong

@@ -25,7 +25,7 @@ from smoothdiff._outcomes import (
     PoolLostError,
     SuspectError,
 )
-from smoothdiff._processes import NotImportableError, Processes, Seconds
+from smoothdiff._processes import NotImportableError, Processes, Seconds, how_to_import
 
 # after these no call can be made
 _ENDS = concurrent.futures.BrokenExecutor, AllHangError, NotImportableError
@@ -159,8 +159,7 @@ class AtOnce:
             ForkingPickler.dumps(fun)
         except Exception as error:
             lost = NotImportableError(
-                f"{fun!r} cannot be sent to processes: define it at the top level of a module "
-                f"({error})"
+                f"{fun!r} cannot be sent to processes: {how_to_import(fun)} ({error})"
             )
             raise PoolLostError(lost, which) from lost
         self._sendable = fun

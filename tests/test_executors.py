@@ -3,6 +3,7 @@
 import concurrent.futures
 import os
 import signal
+import sys
 import threading
 import time
 from concurrent.futures.process import BrokenProcessPool
@@ -81,6 +82,19 @@ def test_what_a_worker_cannot_import_ends_the_run(workers):
     local = lambda x: x
     with pytest.raises(sd.BlackBoxError, match=r"cannot import .*top level of a module"):
         sd.black_box(local, 0.0, executor=workers, on_error="nan")(1.0)
+
+
+def decorated(x):
+    return x
+
+
+@pytest.mark.parametrize("ours", [True, False])
+def test_a_decorator_hides_a_function_from_processes(ours, workers, monkeypatch):
+    with concurrent.futures.ProcessPoolExecutor(1) as pool:  # which begins none
+        f = sd.black_box(decorated, 0.0, executor=workers if ours else pool)
+        monkeypatch.setattr(sys.modules[__name__], "decorated", f)
+        with pytest.raises(sd.BlackBoxError, match=r"decorator .* f = sd.black_box\(decorated,"):
+            f(1.0)
 
 
 def test_the_number_of_processes():
