@@ -1,7 +1,7 @@
 """`black_box`: a host function of NumPy arrays as a JAX function, with faults that can be read."""
 
-import dataclasses
 import functools
+import inspect
 import os
 from collections.abc import Callable
 from typing import Any
@@ -11,13 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from smoothdiff._callbacks import Calls, jax_function
 from smoothdiff._executors import InTurn, engine
 from smoothdiff._host_calls import HostFunction
-from smoothdiff._host_samples import BlackBoxError, Samples, wait_for
+from smoothdiff._host_samples import BlackBoxError, Samples
 from smoothdiff._numbers import check_real, check_whole
 from smoothdiff._outputs import Outputs
 from smoothdiff._params import is_concrete
-from smoothdiff._reraise import reraise, was_raised
+from smoothdiff._reraise import reraise
 from smoothdiff._store import Store
 
 
@@ -49,7 +50,7 @@ def black_box(
 
     Args:
         fun: Called with positional arguments of the same structure as those of the JAX function,
-            their leaves read-only NumPy arrays.
+            their leaves read-only NumPy arrays. The JAX function also takes them by name.
         out: What `fun` returns: a `jax.ShapeDtypeStruct`, a pytree of them, or an example. For one
             sample, also when `batched`. 64-bit types are narrowed where JAX has them switched off.
             Floats are rounded to these types; any other change of a value raises. If left out, the
@@ -62,7 +63,8 @@ def black_box(
         executor: Where single calls run, several at once, each result taken when it comes: a
             `concurrent.futures.Executor`, such as a `ThreadPoolExecutor`; `smoothdiff.Processes`,
             for functions that crash or hang; or the `distributed.Client` of a Dask cluster, for
-            many machines. Processes must be spawned, as a fork of JAX can hang.
+            many machines. Processes must be spawned, as a fork of JAX can hang, and import `fun` by
+            its name, which a decorator would take.
         on_error: "raise", or "nan" so that a sample for which `fun` raises an exception, calls
             `sys.exit`, loses its worker or runs out of time is NaN in every output (the whole batch
             if `batched`). `nonfinite="drop"` in the transforms then leaves it out. A wrong
@@ -80,7 +82,10 @@ def black_box(
             evaluated once. Neither errors nor NaN are kept, as their reason may be gone the next
             time: such a point is evaluated each time that it is asked for. Several processes
             may use the file; it is an SQLite database, so on a disk of this machine. It is of one
-            function, as checkpoints are. `smoothdiff.load_store` reads it.
+            function, as checkpoints are, and each batch sees whether it still is that one. If only
+            something that can change in place differs, such as an attribute, a warning says so,
+            and no values are added. Large NumPy arrays that `fun` closes over are read for that,
+            arrays of JAX only once. `smoothdiff.load_store` reads the file.
 
     Returns:
         A JAX function with the name and docstring of `fun`.
@@ -148,66 +153,28 @@ def black_box(
     nan = on_error, on_nonfinite
     host = HostFunction(fun, name, batched, engine(executor), *nan, retries, timeout, kept)
     _check(host, store)
-    promised = None if out is None else _jax_function(host, Outputs.like(out))
-    found = _Found()
+    calls = Calls.of(host, out)
 
     @functools.wraps(fun)
-    def box(*args):
-        if kept is not None:
-            kept.check()
-        args = jax.tree.map(_array, args)
+    def box(*args, **named):
+        if host.store is not None:
+            host.store.check()
+        args = _positional(host, args, named) if named else args
+        args = jax.tree.map(functools.partial(_array, host.name), args)
         leaves, tree = jax.tree.flatten(args)
         shapes = tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves)
-        call = promised or found.calls.get((tree, shapes))
+        call = calls.promised or calls.found.get((tree, shapes))
         if call is None:
             if not all(map(is_concrete, leaves)):
-                raise UnknownOutputError(_unknown(name, tree.unflatten(shapes)))
+                raise UnknownOutputError(_unknown(host.name, tree.unflatten(shapes)))
             result, outputs = _first(host, leaves, tree)
-            found.calls[tree, shapes] = _jax_function(host, outputs)
+            calls.found[tree, shapes] = jax_function(host, outputs)
             return result
         # Outside of jit the error is ours to raise; while jit traces, neither line does anything.
         with reraise():
             return jax.block_until_ready(call(*args))
 
     return box
-
-
-@dataclasses.dataclass
-class _Found:
-    """The JAX function for each structure of arguments that was met; says nothing of the values."""
-
-    calls: dict[Any, Callable[..., Any]] = dataclasses.field(default_factory=dict, compare=False)
-
-
-def _jax_function(host: HostFunction, outputs: Outputs) -> Callable[..., Any]:
-    """The host function, of which it is known what it returns, as a JAX function."""
-    for option in ("on_error", "on_nonfinite"):
-        if getattr(host, option) == "nan" and not outputs.have_nan():
-            raise ValueError(
-                f'{option}="nan" needs every output to be of floats, as integers have no NaN: '
-                f'return floats, or write {option}="raise"'
-            )
-
-    @jax.custom_jvp
-    def call(*args):
-        leaves, tree = jax.tree.flatten(args)
-        ndims, shapes = tuple(leaf.ndim for leaf in leaves), outputs.shapes()
-        callback = _Callback(host, tree, ndims, outputs.tree, shapes, _is_x64())
-        # Under vmap, however nested, one callback gets the whole batch.
-        results = jax.pure_callback(callback, shapes, *leaves, vmap_method="expand_dims")
-        return outputs.tree.unflatten(results)
-
-    # Only a tangent that arrives gets here; where the arguments are stopped, none does.
-    @call.defjvp
-    def no_derivative(primals, tangents):
-        raise TypeError(
-            f"the black box {host.name!r} has no derivative: smooth the function that calls it, "
-            "for example with sd.smooth(fun, sigma) or sd.smooth_grad(fun, sigma), "
-            "or stop the derivative with jax.lax.stop_gradient. A leaf whose sigma is None and "
-            'baseline="ad" need one, too'
-        )
-
-    return call
 
 
 def _first(host: HostFunction, leaves: list[jax.Array], tree: Any) -> tuple[PyTree, Outputs]:
@@ -238,45 +205,39 @@ def _unknown(name: str, args: tuple) -> str:
     )
 
 
-@dataclasses.dataclass(frozen=True)
-class _Callback:
-    """What JAX calls. Equal for equal fields, so that calls outside of jit compile only once."""
-
-    host: HostFunction
-    tree: Any
-    ndims: tuple[int, ...]
-    out_tree: Any
-    shapes: tuple[jax.ShapeDtypeStruct, ...]
-    x64: bool
-
-    def __call__(self, *leaves: Any) -> list[np.ndarray]:
-        try:
-            if self.x64 and not _is_x64():  # JAX would round arguments to float32
-                raise BlackBoxError(_X64.format(self.host.name))
-            wait_for(leaves, self.host.name)
-            samples = Samples(leaves, self.ndims, self.tree)
-            outs = [np.empty((len(samples), *out.shape), out.dtype) for out in self.shapes]
-            self.host(samples, outs, self.out_tree)
-            return [out.reshape(samples.batch_shape + out.shape[1:]) for out in outs]
-        except BaseException as error:
-            was_raised(error)
-            raise
+def _positional(host: HostFunction, args: tuple, named: dict[str, Any]) -> tuple:
+    """The arguments by their places, some of which were given by name."""
+    needs = f"the black box {host.name!r} takes arguments by their places"
+    try:
+        bound = inspect.signature(host.fun).bind(*args, **named)
+    except ValueError as error:  # as of functions in C
+        raise TypeError(f"{needs}, not by names such as {next(iter(named))!r}") from error
+    except TypeError as error:
+        raise TypeError(f"the black box {host.name!r}: {error}") from error
+    if bound.kwargs:  # what lies between has its default
+        bound.apply_defaults()
+    if bound.kwargs:
+        raise TypeError(
+            f"{needs}, and {', '.join(bound.kwargs)} can only be given by name: leave out the `*` "
+            "or `**` in its definition, or make the box of a lambda"
+        )
+    return bound.args
 
 
-_X64 = (
-    "the black box {!r} is part of a program in float64, but JAX calls it from another thread, and "
-    "jax.enable_x64(True) holds in one thread alone: write "
-    'jax.config.update("jax_enable_x64", True) instead, at the start of the program'
-)
-
-
-def _is_x64() -> bool:
-    """Whether float64 is on in this thread."""
-    return jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
-
-
-def _array(leaf: Any) -> jax.Array:
-    array = jnp.asarray(leaf)
+def _array(name: str, leaf: Any) -> jax.Array:
+    try:
+        array = jnp.asarray(leaf)
+    except TypeError as error:
+        advice = ""
+        if hasattr(type(leaf), name):
+            advice = (
+                ". It is the `self` of a method: make the box of the bound method instead, as "
+                f"f = sd.black_box({type(leaf).__name__}(...).{name}), with the method as it was"
+            )
+        raise TypeError(
+            f"the black box {name!r} takes numbers, arrays and pytrees of them, not {leaf!r}"
+            f"{advice}"
+        ) from error
     if jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
         raise TypeError(
             "a host function cannot take a typed key: pass jax.random.key_data(key), or a seed"

@@ -20,7 +20,11 @@ import numpy as np
 # names of parts have so many dots at most; what lies deeper counts as a piece of the last one
 _DOTS = 4
 _PLAIN = type(None), bool, int, float, complex, str, bytes, type(...), type(NotImplemented)
-_Facts = Iterator[tuple[str, bytes]]
+_Facts = Iterator[tuple[str, bytes | None]]
+
+
+class Unknown:
+    """In place of a value that is not known yet, and so differs from none."""
 
 
 class _Met(NamedTuple):
@@ -33,7 +37,7 @@ class _Met(NamedTuple):
     arrays: dict[int, tuple[jax.Array, bytes]]
 
 
-def parts(values: dict[str, Any], arrays: dict | None = None) -> dict[str, str]:
+def parts(values: dict[str, Any], arrays: dict | None = None) -> dict[str, str | None]:
     """Digests of the values and, under names with a dot, of what each is made of.
 
     Numbers, texts, arrays and containers count by value. A function counts by its code, constants
@@ -52,14 +56,19 @@ def parts(values: dict[str, Any], arrays: dict | None = None) -> dict[str, str]:
         For each name of a part its digest. The closure variable `scale` of a function that is given
         as `fun` is "fun.scale". After a colon stands what can change in place: the attribute
         `count` of an ordinary object there is "fun.scale:count", the items of a list or a dict
-        "fun.scale:".
+        "fun.scale:". Of what is `Unknown` it is None.
     """
+    unknown: dict[str, str | None] = {}
     hashes: dict[str, Any] = {}
     for name, value in values.items():
         for part, fact in _facts(name, value, _Met({}, {} if arrays is None else arrays)):
+            if fact is None:
+                unknown[part] = None
+                continue
             digest = hashes.setdefault(part, hashlib.blake2b(digest_size=16))
             digest.update(len(fact).to_bytes(8, "little") + fact)
-    return {part: digest.hexdigest() for part, digest in hashes.items()}
+    # what is unknown deep down counts as a piece, as all that is known there does
+    return unknown | {part: digest.hexdigest() for part, digest in hashes.items()}
 
 
 def digest_of(array: np.ndarray) -> bytes:
@@ -67,6 +76,15 @@ def digest_of(array: np.ndarray) -> bytes:
     digest = hashlib.blake2b(f"{array.dtype} {array.shape} ".encode(), digest_size=16)
     digest.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
     return digest.digest()
+
+
+def custom_nodes(tree: Any) -> Iterator[tuple[type, Any]]:
+    """The nodes of a tree that are not of Python's types: each type, and its static data."""
+    node = tree.node_data()
+    if node is not None and node[0] not in (tuple, list, dict, type(None)):
+        yield node
+    for child in tree.children():
+        yield from custom_nodes(child)
 
 
 def _facts(name: str, value: Any, met: _Met) -> _Facts:
@@ -86,9 +104,14 @@ def _facts(name: str, value: Any, met: _Met) -> _Facts:
         yield part, " ".join([kind.__name__, *sorted(map(_whole, value))]).encode()
     elif kind is types.CodeType:
         yield from _code(name, value, met)
-    elif isinstance(value, types.ModuleType | jax.tree_util.PyTreeDef):
-        text = value.__name__ if isinstance(value, types.ModuleType) else _without_addresses(value)
-        yield name, text.encode()
+    elif kind is Unknown:
+        yield name, None
+    elif isinstance(value, types.ModuleType):
+        yield name, value.__name__.encode()
+    elif isinstance(value, jax.tree_util.PyTreeDef):
+        yield name, _without_addresses(value).encode()
+        for node in custom_nodes(value):
+            yield from _facts(name, node, met)
     elif id(value) in met.objects:
         yield name, f"see {met.objects[id(value)][1]}".encode()
     else:

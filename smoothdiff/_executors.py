@@ -1,4 +1,4 @@
-"""How calls of a host function are made: one after another, or several at once by an executor.
+"""How calls of a host function are made by an executor, several at once.
 
 Runs inside JAX's callbacks, so no JAX here.
 """
@@ -15,6 +15,7 @@ from typing import Any
 
 from smoothdiff._ctrl_c import raise_if_pressed
 from smoothdiff._host_samples import Samples
+from smoothdiff._in_turn import InTurn
 from smoothdiff._outcomes import (
     FAULTS,
     AllHangError,
@@ -25,7 +26,7 @@ from smoothdiff._outcomes import (
     PoolLostError,
     SuspectError,
 )
-from smoothdiff._processes import NotImportableError, Processes, Seconds
+from smoothdiff._processes import NotImportableError, Processes, Seconds, how_to_import
 
 # after these no call can be made
 _ENDS = concurrent.futures.BrokenExecutor, AllHangError, NotImportableError
@@ -33,34 +34,6 @@ _ENDS = concurrent.futures.BrokenExecutor, AllHangError, NotImportableError
 _LOSSES = 5
 # seconds for calls to end that run when others have failed; a later value is kept if all lives on
 _PROMPT = 2.0
-
-
-class InTurn:
-    """Calls in the thread that waits for them; a failed one goes to the end of the line."""
-
-    def outcomes(
-        self,
-        fun: Callable[..., Any],
-        samples: Samples,
-        which: Iterable[int | None],
-        retries: int,
-        timeout: Seconds,
-        late: Late,
-    ) -> Outcomes:
-        """As for `AtOnce`."""
-        del timeout, late  # for executors
-        line = deque((sample, 1) for sample in which)
-        while line:
-            raise_if_pressed()
-            sample, tries = line.popleft()
-            try:
-                outcome = Outcome(sample, tries, fun(*samples.arguments(sample)), None)
-            except FAULTS as error:
-                if tries <= retries:
-                    line.append((sample, tries + 1))
-                    continue
-                outcome = Outcome(sample, tries, None, error)
-            yield outcome
 
 
 @dataclasses.dataclass
@@ -153,9 +126,9 @@ class AtOnce:
                 call = calls[ticket]
                 try:
                     value, error = self._result(call.future, timeout), None
-                except _ENDS:
-                    raise
                 except FAULTS as fault:
+                    if isinstance(fault, _ENDS) and not self._lives_on(fault):
+                        raise
                     value, error = None, fault
                     give_up([call], 0)
                 del calls[ticket]
@@ -187,8 +160,7 @@ class AtOnce:
             ForkingPickler.dumps(fun)
         except Exception as error:
             lost = NotImportableError(
-                f"{fun!r} cannot be sent to processes: define it at the top level of a module "
-                f"({error})"
+                f"{fun!r} cannot be sent to processes: {how_to_import(fun)} ({error})"
             )
             raise PoolLostError(lost, which) from lost
         self._sendable = fun
@@ -222,6 +194,16 @@ class AtOnce:
             else:
                 if ticket in calls:  # else it was given up before
                     return ticket
+
+    def _lives_on(self, fault: BaseException) -> bool:
+        """Whether it was the function that raised what a broken executor raises."""
+        if not isinstance(fault, concurrent.futures.BrokenExecutor):
+            return False
+        try:
+            self._executor.submit(int).cancel()
+        except RuntimeError:
+            return False
+        return True
 
     def _glance(self) -> None:
         """Sees that the executor has what it needs, and that all is wanted, while nothing comes."""

@@ -51,40 +51,47 @@ class HostFunction:
     def __call__(self, samples: Samples, outs: Sequence[np.ndarray], out_tree: Any) -> None:
         """Evaluates all samples and writes the results into `outs`, one row per sample."""
         if self.store is None:
-            return self._evaluate(samples, outs, out_tree)
-        points = self.store.points(samples)
-        known = self._fill(self.store.find(points), outs)
+            self._evaluate(samples, outs, out_tree)
+        else:
+            with self.store.calls():
+                self._look_up(self.store, samples, outs, out_tree)
+
+    def _look_up(
+        self, store: Store, samples: Samples, outs: Sequence[np.ndarray], out_tree: Any
+    ) -> None:
+        """Evaluates those samples that are not in the store."""
+        points = store.points(samples)
+        known = self._fill(store.find(points), outs)
         if known.all():
-            return None
+            return
         # of samples that are the same point one is evaluated for all
         seen: dict[str, int] = {}
         first = np.array([seen.setdefault(point, i) for i, point in enumerate(points)])
         asked = ~known & (first == np.arange(len(points)))
         rest = samples.only(asked)
         rows = [np.empty((len(rest), *out.shape[1:]), out.dtype) for out in outs]
-        try:
-            self._evaluate(rest, rows, out_tree)
-        finally:
-            self.store.settle()
+        self._evaluate(rest, rows, out_tree)
         same = ~known & ~asked
         for out, row in zip(outs, rows, strict=True):
             out[asked] = row
             out[same] = out[first[same]]
-        return None
 
     def first(self, samples: Samples) -> Any:
         """What a call returns of which nothing is known yet, and which must not fail."""
-        if self.store is not None:
+        if self.store is None:
+            return self._first(samples)
+        with self.store.calls():
             (found,) = self.store.find(self.store.points(samples))
             with contextlib.suppress(ValueError):
                 if found is not None:
                     value = found.tree(flat=False)
                     return jax.tree.map(lambda leaf: leaf[None], value) if self.batched else value
+            return self._first(samples)
+
+    def _first(self, samples: Samples) -> Any:
         unknown = lambda i, value: None
         with contextlib.closing(self._outcomes(samples, unknown)) as outcomes:
             (outcome,) = outcomes
-        if self.store is not None:
-            self.store.settle()
         if outcome.error is not None:
             failure = self._failure(samples, outcome, outcome.error)
             if self.on_error == "nan":

@@ -3,6 +3,7 @@
 No call into JAX here, which can hang in a callback, but for asking an array whether it is there.
 """
 
+import functools
 import math
 import time
 from collections.abc import Sequence
@@ -10,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from smoothdiff._digest import digest_of
+from smoothdiff._digest import custom_nodes, digest_of, parts
 
 
 class BlackBoxError(RuntimeError):
@@ -90,6 +91,11 @@ class Samples:
         """The arrays in the arguments of sample `i`."""
         index = (*np.unravel_index(i, self.batch_shape), ...)
         return [array[index] for array in self._arrays]
+
+    @functools.cached_property
+    def nodes(self) -> dict[str, str | None]:
+        """Digests of what the tree holds beside the arrays, which its text need not say."""
+        return parts({"": self.tree}) if any(custom_nodes(self.tree)) else {}
 
     def only(self, chosen: np.ndarray) -> "Samples":
         """The samples for which this is true."""

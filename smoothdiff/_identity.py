@@ -19,9 +19,13 @@ class Identity:
         """The names of the parts that are not as they are in others, which were kept."""
         return _differing(self.parts, kept)
 
+    def changed(self) -> set[str]:
+        """The names of those that have changed since."""
+        return _differing(self.parts, parts(self._values, self._arrays))
+
     def settle(self) -> set[str]:
         """The names of those that have changed since, while all went on: they do not count."""
-        changed = _differing(self.parts, parts(self._values, self._arrays))
+        changed = self.changed()
         self.parts |= dict.fromkeys(changed)
         return changed
 

@@ -102,8 +102,10 @@ def minimise(
             `max_evaluations` it goes on. The file is written as often as is cheap, and at the end,
             whatever ended the run; a warning says if that fails. A run is continued only if the
             call is the same, numbers and code included, and if `fun` gives the same value again at
-            the lowest point. That evaluation is not counted. A `target` may change, but within
-            bounds not come or go, as the default solver would.
+            the lowest point. That evaluation is not counted; nor are the one that tells what a
+            black box without `out` returns, and, where a run goes on after a limit, the few by
+            which the result was judged there. A `target` may change, but within bounds not come or
+            go, as the default solver would.
 
     Returns:
         A `Result`.

@@ -6,6 +6,7 @@ import os
 import pickle
 import queue
 import signal
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -20,11 +21,23 @@ class NotImportableError(RuntimeError):
     """A worker process cannot have the function."""
 
 
-_UNKNOWN = (
-    "a worker process cannot import {}: define it at the top level of a module, neither in a "
-    'notebook nor in another function, and put the work of a script under if __name__ == "__main__"'
-    ": ({})"
+_HIDDEN = (
+    "the decorator has taken its name, so leave the decorator out and give the box a name of its "
+    "own, as f = sd.black_box({}, ...)"
 )
+_INSIDE = (
+    "define it at the top level of a module, neither in a notebook nor in another function, and "
+    'put the work of a script under if __name__ == "__main__":'
+)
+
+
+def how_to_import(fn: Callable) -> str:
+    """What to do so that other processes can import a function, which they cannot now."""
+    found = sys.modules.get(getattr(fn, "__module__", None) or "")
+    name = getattr(fn, "__qualname__", "")
+    for part in name.split("."):
+        found = getattr(found, part, None)
+    return _HIDDEN.format(name) if getattr(found, "__wrapped__", None) is fn else _INSIDE
 
 
 class Processes(concurrent.futures.Executor):
@@ -137,7 +150,7 @@ class _Worker:
         try:
             return self._informed(fn).submit(fn, *args, **kwargs)
         except concurrent.futures.BrokenExecutor as error:
-            raise NotImportableError(_UNKNOWN.format(fn, error)) from error.__cause__
+            raise _not_importable(fn, error) from error.__cause__
 
     def _informed(self, fn: Callable) -> "concurrent.futures.ProcessPoolExecutor":
         if self._pool is None:
@@ -150,6 +163,10 @@ class _Worker:
             try:
                 self._pool.submit(callable, fn).result()
             except (pickle.PicklingError, AttributeError, TypeError) as error:
-                raise NotImportableError(_UNKNOWN.format(fn, error)) from error
+                raise _not_importable(fn, error) from error
             self._knows = fn
         return self._pool
+
+
+def _not_importable(fn: Callable, error: Exception) -> NotImportableError:
+    return NotImportableError(f"a worker process cannot import {fn}: {how_to_import(fn)} ({error})")

@@ -26,14 +26,22 @@ def reraise() -> Iterator[None]:
     except (jax.errors.JaxRuntimeError, ValueError) as failure:
         text = str(failure)
         for error in reversed(raised):
-            if type(error).__name__ in text and str(error) in text:
+            if type(error).__name__ in text and _clean(error) in text:
                 raise error.with_traceback(None) from error.__cause__
         raise
     finally:
         del _open_blocks[id(raised)]
 
 
-def was_raised(error: BaseException) -> None:
-    """Puts aside what a callback raises."""
+def was_raised(error: BaseException) -> BaseException:
+    """Puts aside what a callback raises, and gives what to raise so that JAX can have its text."""
     for raised in list(_open_blocks.values()):
         raised.append(error)
+    text = _clean(error)
+    return error if text == str(error) else RuntimeError(f"{type(error).__name__}: {text}")
+
+
+def _clean(error: BaseException) -> str:
+    """The text without what XLA cannot take: it crashes at a lone surrogate, and ends at a NUL."""
+    text = str(error).encode(errors="backslashreplace").decode()
+    return text.replace("\0", r"\x00")

@@ -6,7 +6,7 @@ import operator
 import os
 import time
 import warnings
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,8 @@ from smoothdiff._unit_space import UnitSpace
 
 # what a checkpoint has before there was a trial
 _NO_TRIAL = Trial(np.empty(0), False)
+# the numbers of a judgement
+_NUMBERS = "fun", "smoothed", "stderr", "evaluations"
 # the share of the time that saving may take
 _SAVING = 0.05
 _NONFINITE = "an estimate was NaN or infinite; `result` has what was found before. "
@@ -46,6 +48,13 @@ _UNBOUNDED = (
 )
 
 
+class _Judgement(NamedTuple):
+    """What ended a run, so that the same call need not pay for it again; none without numbers."""
+
+    y: PyTree
+    numbers: np.ndarray
+
+
 @dataclasses.dataclass
 class Run:
     """Where a run stands: at every moment something that can be returned or saved."""
@@ -61,6 +70,7 @@ class Run:
     save_due: float = 0.0
     stopped: Bool[Array, ""] | None = None
     trial: Trial | None = None
+    judgement: _Judgement | None = None
 
     @property
     def steps(self) -> int:
@@ -100,12 +110,13 @@ class Run:
         )
         iterate = self.units.natural(self.y) if self.keep_iterates else None
         record = Record(0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, iterate)
-        saved = file.load((self.y, self.state, record, _NO_TRIAL))
+        saved = file.load((self.y, self.state, record, _NO_TRIAL, self._no_judgement()))
         if saved is not None:
             with problem.place():
                 self.y, self.state = jax.tree.map(jnp.asarray, saved[:2])
             self.history, trial = _unstack(saved[2]), saved[3]
             self.trial = Trial(trial.fun, bool(trial.noisy)) if trial.fun.size else None
+            self.judgement = saved[4] if saved[4].numbers.size else None
             self.start -= self.history[-1].seconds
             self._check_function(file)
             problem.resumed(self.state)
@@ -146,7 +157,8 @@ class Run:
         before = time.monotonic()
         history = jax.tree.map(lambda *leaves: np.stack(leaves), *self.history[: self.steps])
         try:
-            self.file.save((self.y, self.state, history, self.trial or _NO_TRIAL))
+            ended = self.trial or _NO_TRIAL, self.judgement or self._no_judgement()
+            self.file.save((self.y, self.state, history, *ended))
         except Exception as error:
             text = f"the checkpoint was not saved, the run goes on: {type(error).__name__}: {error}"
             warnings.warn(text, RuntimeWarning, stacklevel=2)
@@ -185,7 +197,7 @@ class Run:
         # Ctrl-C may come between any two lines: the state has the last word on what was done
         kept = record.y if self.keep_iterates else None
         self.history.append(record._replace(y=kept, best=None))
-        self.y, self.state, self.stopped = y, state, stopped
+        self.y, self.state, self.stopped, self.judgement = y, state, stopped, None
         if self.trial is not None and self.trial.noisy:
             self.trial = None  # of a run that had ended: another point may be lowest now
         if time.monotonic() >= self.save_due:
@@ -194,16 +206,23 @@ class Run:
 
     def judged(self, reason: str, target: float | None = None) -> Result:
         """The result of a run that ended well, for this reason or with the target."""
-        with reraise(), self.problem.place():
-            judged = self.problem.judge(self.y, self.state, self.trial)
-            y, stats = jax.block_until_ready(judged)
-        # a last batch that fails costs no more than the smoothed value
-        if not np.isfinite(stats["fun"]):
-            raise self._nonfinite()
-        numbers = {name: value.item() for name, value in stats.items()}
+        if self.judgement is None:
+            with reraise(), self.problem.place():
+                judged = self.problem.judge(self.y, self.state, self.trial)
+                y, stats = jax.block_until_ready(judged)
+            # a last batch that fails costs no more than the smoothed value
+            if not np.isfinite(stats["fun"]):
+                raise self._nonfinite()
+            self.judgement = _Judgement(y, np.array([stats[name].item() for name in _NUMBERS]))
+        y, values = self.judgement
+        numbers = dict(zip(_NUMBERS, values.tolist(), strict=True))
+        numbers["evaluations"] = int(numbers["evaluations"])
         # the judgement may be what finds it
         reached = target is not None and numbers["fun"] <= target
         return self._result(y, "target" if reached else reason, **numbers)
+
+    def _no_judgement(self) -> _Judgement:
+        return _Judgement(self.y, np.empty(0))
 
     def _ours(self) -> Any:
         """The solver, or the one of ours within another."""

@@ -7,7 +7,6 @@ import os
 import re
 import sqlite3
 import threading
-import time
 import warnings
 import weakref
 from collections.abc import Callable, Iterator, Sequence
@@ -18,19 +17,10 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
+from smoothdiff._database import connected, make, translated
 from smoothdiff._digest import digest_of
 from smoothdiff._host_samples import Samples
 from smoothdiff._identity import Identity, can_change, listed
-
-# seconds to wait for another process that writes
-_PATIENCE = 60.0
-# An array stands there once, however many points share it; points and values name arrays by their
-# digests. The order of the rows is that in which they came.
-_TABLES = """
-create table if not exists function (part text primary key, digest text);
-create table if not exists arrays (id text primary key, dtype text, shape text, data blob);
-create table if not exists evaluations (point text primary key, value text);
-"""
 
 
 class Evaluation(NamedTuple):
@@ -92,7 +82,7 @@ def load_store(path: str | os.PathLike) -> list[Evaluation]:
     """
     if not Path(path).exists():
         raise FileNotFoundError(f"there is no store {path}")
-    with _translated(Path(path)), contextlib.closing(_connected(Path(path))) as file:
+    with translated(Path(path)), contextlib.closing(connected(Path(path))) as file:
         rows = file.execute("select point, value from evaluations order by rowid").fetchall()
         return [Evaluation(*(_read(file, text).tree() for text in row)) for row in rows]
 
@@ -120,7 +110,9 @@ class Store:
         """Names the file, which is made, with its directory, when it is first needed."""
         self._path, self._fun = Path(path), fun
         self._identity: Identity | None = None
-        self._settled = False
+        # the parts in which the function differs from that of the file
+        self._differ: set[str] = set()
+        self._under_way = 0
         # open all the time, as the last one who closes the file waits for the disk; callbacks run
         # in threads of JAX's
         self._connection: sqlite3.Connection | None = None
@@ -136,7 +128,7 @@ class Store:
             return
         identity = Identity(fun=self._fun)
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        _make(self._path)
+        make(self._path)
         with self._opened() as file:
             file.execute("begin immediate")
             kept = dict(file.execute("select part, digest from function"))
@@ -146,29 +138,45 @@ class Store:
             file.execute("commit")
         differ = identity.differing(kept)
         what = f"the store {self._path} was written when {listed(differ)} was another"
+        advice = (
+            "name another file. If the function still returns the same values, forget what it was: "
+            f"with sqlite3.connect({str(self._path)!r}) as file: "
+            'file.execute("delete from function")'
+        )
         if not all(map(can_change, differ)):
-            raise ValueError(
-                f"{what}: name another file. If the function still returns the same values, forget "
-                f"what it was: with sqlite3.connect({str(self._path)!r}) as file: "
-                'file.execute("delete from function")'
-            )
+            raise ValueError(f"{what}: {advice}")
         if differ:
-            warnings.warn(f"{what}; its values are taken as they are", RuntimeWarning, stacklevel=3)
-        self._identity = identity
+            text = f"{what}; its values are taken as they are, and none are added: {advice}"
+            warnings.warn(text, RuntimeWarning, stacklevel=3)
+        self._identity, self._differ = identity, differ
 
-    def settle(self) -> None:
-        """What the first calls have changed in the function does not tell it from others."""
-        if self._identity is None or self._settled:
-            return
-        self._settled = True
-        if changed := [(name,) for name in self._identity.settle()]:
-            query = "update function set digest = null where part = ?"
-            self._try(lambda file: file.executemany(query, changed), "written to")
+    @contextlib.contextmanager
+    def calls(self) -> Iterator[None]:
+        """Around calls of the function.
+
+        What they change in it does not tell it from others. What has changed before them does.
+        """
+        with self._lock:
+            if self._identity is None or (not self._under_way and self._identity.changed()):
+                self._identity = None
+                self.check()
+            self._under_way += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._under_way -= 1
+                self._settle()
+
+    def _settle(self) -> None:
+        if self._identity is not None and (changed := self._identity.settle()):
+            self._differ -= changed
+            query, names = "update function set digest = null where part = ?", zip(changed)
+            self._try(lambda file: file.executemany(query, names), "written to")
 
     def points(self, samples: Samples) -> list[str]:
         """What the samples are called here; the same for those that are the same point."""
-        which = range(len(samples))
-        return [_described(samples.leaves(i), samples.tree, samples.digest)[0] for i in which]
+        return [_point(samples, i)[0] for i in range(len(samples))]
 
     def find(self, points: Sequence[str]) -> list[Found | None]:
         """The values of the points that are there, else None."""
@@ -184,8 +192,13 @@ class Store:
         return found
 
     def put(self, samples: Samples, i: int, value: Sequence[np.ndarray], out_tree: Any) -> None:
-        """Keeps the value of sample `i`, as leaves; it is on the disk when this returns."""
-        point, arrays = _described(samples.leaves(i), samples.tree, samples.digest)
+        """Keeps the value of sample `i`, as leaves; it is on the disk when this returns.
+
+        Unless the function differs from that of the file, whose values they then are not.
+        """
+        if self._differ:
+            return
+        point, arrays = _point(samples, i)
         text, more = _described(value, out_tree, digest_of)
 
         def write(file: sqlite3.Connection) -> None:
@@ -214,9 +227,9 @@ class Store:
     @contextlib.contextmanager
     def _opened(self) -> Iterator[sqlite3.Connection]:
         """The file, for one thread at a time; what was not committed is undone."""
-        with self._lock, _translated(self._path):
+        with self._lock, translated(self._path):
             if self._connection is None or not self._path.exists():  # deleted, it would be kept
-                self._connection = _connected(self._path)
+                self._connection = connected(self._path)
                 weakref.finalize(self, self._connection.close)
             try:
                 yield self._connection
@@ -225,56 +238,26 @@ class Store:
                     self._connection.rollback()
 
 
-def _connected(path: Path) -> sqlite3.Connection:
-    file = sqlite3.connect(path, _PATIENCE, isolation_level=None, check_same_thread=False)
-    # what was written outlives a kill
-    file.execute("pragma synchronous = normal")
-    return file
-
-
-def _make(path: Path) -> None:
-    """Makes the tables, if there are none."""
-    end = time.monotonic() + _PATIENCE
-    while True:
-        try:
-            with _translated(path), contextlib.closing(_connected(path)) as file:
-                # others read while one writes
-                file.execute("pragma journal_mode = wal")
-                file.executescript(_TABLES)
-                return
-        except sqlite3.OperationalError as error:
-            if error.sqlite_errorcode == sqlite3.SQLITE_CANTOPEN:
-                raise OSError(f"{path} cannot be opened as a store: {error}") from error
-            # several begin at once, and SQLite does not wait here
-            if time.monotonic() > end:
-                raise
-            time.sleep(0.01)
-
-
-@contextlib.contextmanager
-def _translated(path: Path) -> Iterator[None]:
-    """The error of a file that is none of SQLite's says what to do."""
-    try:
-        yield
-    except sqlite3.DatabaseError as error:
-        if isinstance(error, sqlite3.OperationalError):  # locked, full, gone
-            raise
-        raise ValueError(f"{path} is not a store of evaluations: name another file") from error
+def _point(samples: Samples, i: int) -> tuple[str, dict[str, np.ndarray]]:
+    return _described(samples.leaves(i), samples.tree, samples.digest, samples.nodes)
 
 
 def _described(
-    leaves: Sequence[np.ndarray], tree: Any, digest: Callable[[np.ndarray], bytes]
+    leaves: Sequence[np.ndarray],
+    tree: Any,
+    digest: Callable[[np.ndarray], bytes],
+    nodes: dict[str, str | None] | None = None,
 ) -> tuple[str, dict[str, np.ndarray]]:
     """What arguments or a value are, as text that names the arrays, and these by name."""
     names = [digest(leaf).hex() for leaf in leaves]
     places = repr(tree.unflatten(range(len(names))))
-    text = json.dumps([re.sub(r" at 0x[0-9a-f]+", "", places), names])
-    return text, dict(zip(names, leaves, strict=True))
+    text = [re.sub(r" at 0x[0-9a-f]+", "", places), names, *([nodes] if nodes else [])]
+    return json.dumps(text), dict(zip(names, leaves, strict=True))
 
 
 def _read(file: sqlite3.Connection, text: str) -> Found:
     """What the text describes."""
-    places, names = json.loads(text)
+    places, names, *_ = json.loads(text)
     query = "select dtype, shape, data from arrays where id = ?"
     rows = (file.execute(query, (name,)).fetchone() for name in names)
     return Found([np.frombuffer(c, a).reshape(json.loads(b)) for a, b, c in rows], places)

@@ -53,6 +53,31 @@ def test_each_sample_is_evaluated_once_under_every_transform(way, batched, jit):
     assert counted.calls == (batches if batched else 6)
 
 
+def test_arguments_by_name():
+    box = black_box(lambda x, shift=0.5, scale=2.0: scale * (x + shift), 0.0)
+    assert box(x=1.0) == 3.0
+    assert box(1.0, scale=4.0) == 6.0
+    assert jax.jit(lambda x: box(scale=x, x=1.0, shift=1.0))(3.0) == 6.0
+    with pytest.raises(TypeError, match=r"black box '<lambda>': .*unexpected .*'size'"):
+        box(1.0, size=2.0)
+    with pytest.raises(TypeError, match="by their places, and scale can only be given by name"):
+        black_box(lambda x, *, scale: x, 0.0)(1.0, scale=2.0)
+    with pytest.raises(TypeError, match="by their places, not by names such as 'out'"):
+        black_box(max, 0.0)(1.0, out=2.0)
+
+
+def test_what_is_no_array_is_named_and_a_method_most_of_all():
+    class Simulator:
+        @black_box
+        def run(self, x):
+            return x
+
+    with pytest.raises(TypeError, match=r"(?s)'run' takes .*black_box\(Simulator\(\.\.\.\)\.run"):
+        Simulator().run(1.0)
+    with pytest.raises(TypeError, match=r"pytrees of them, not 'fast'$"):
+        black_box(lambda x, mode: x, 0.0)(1.0, "fast")
+
+
 def test_outside_of_vmap_a_batch_has_size_one():
     shapes = []
     box = black_box(
@@ -242,7 +267,7 @@ def test_arguments_that_never_arrive_raise_instead_of_hanging(monkeypatch):
     with pytest.raises(BlackBoxError, match=r"stairs: .* NPROC=2"):
         wait_for([np.ones(3), Slow(10**9)], "stairs", seconds=0.05)
     never = lambda leaves, name: wait_for([Slow(10**9)], name, seconds=0.05)
-    monkeypatch.setattr("smoothdiff._black_box.wait_for", never)
+    monkeypatch.setattr("smoothdiff._callbacks.wait_for", never)
     # no fault of the function, so that there is no NaN in place of it either
     f = black_box(stairs, SCALAR, on_error="nan")
     with pytest.raises(BlackBoxError, match="NPROC=2"), reraise():
@@ -259,9 +284,9 @@ def test_large_arguments_need_two_threads_of_jax(threads):
     script = """
 import functools, os
 import numpy as np, jax, jax.numpy as jnp, smoothdiff as sd
-from smoothdiff import _black_box
+from smoothdiff import _callbacks
 seconds = 3.0 if os.environ["NPROC"] == "1" else 60.0
-_black_box.wait_for = functools.partial(_black_box.wait_for, seconds=seconds)
+_callbacks.wait_for = functools.partial(_callbacks.wait_for, seconds=seconds)
 f = sd.black_box(lambda x: np.float32(x.mean()), jax.ShapeDtypeStruct((), jnp.float32))
 total = jax.jit(lambda xs: jnp.sum(jax.vmap(f)(xs)))
 xs = jnp.ones((8, 100_000))

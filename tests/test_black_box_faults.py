@@ -66,6 +66,25 @@ def test_reraise_gives_the_original_as_the_cause():
         np.testing.assert_array_equal(awaited(f, abs(XS)), [3.0, 4.0, 9.0, 3.0])
 
 
+@pytest.mark.parametrize("text", ["no file b\udcff", "before\0after"], ids=["surrogate", "NUL"])
+def test_a_text_that_xla_cannot_have(text):
+    """A lone surrogate, as in names of files that are not UTF-8, ended the process."""
+
+    def host(x):
+        raise ValueError(text)
+
+    box = black_box(host, 0.0)
+    for f in (box, jax.jit(box)):
+        with pytest.raises(BlackBoxError) as info:
+            awaited(f, 1.0)
+        assert text in str(info.value)
+        assert type(info.value.__cause__) is ValueError
+    escaped = text.encode("ascii", "backslashreplace").decode().replace("\0", r"\x00")
+    with pytest.raises(jax.errors.JaxRuntimeError, match="BlackBoxError") as info:
+        jax.block_until_ready(jax.jit(box)(2.0))
+    assert escaped in str(info.value)
+
+
 def test_reraise_leaves_other_errors_alone_and_keeps_nothing():
     from smoothdiff import _reraise
 

@@ -18,6 +18,7 @@ import pytest
 
 import smoothdiff as sd
 from smoothdiff._digest import parts
+from smoothdiff._identity import Identity
 
 SCALE = 3.0
 
@@ -141,6 +142,11 @@ PAIRS = {
         lambda: Layer(jnp.ones(2), lambda y: -y),
         ["fun.act"],
     ),
+    "structure": (
+        lambda: jax.tree.structure({"a": Layer(jnp.ones(2), lambda y: y)}),
+        lambda: jax.tree.structure({"a": Layer(jnp.ones(2), lambda y: -y)}),
+        ["fun"],
+    ),
     "dataclass": (lambda: Settings(1.0), lambda: Settings(2.0), ["fun:width"]),
     "adam": (lambda: optax.adam(0.5), lambda: optax.adam(0.05), None),
     "schedule": (
@@ -170,6 +176,15 @@ def test_what_computes_otherwise_differs_and_the_name_of_the_part_says_where(nam
     assert differing(one(), one()) == []
     found = differing(one(), other())
     assert found == where if where else found
+
+
+def test_what_says_nothing_of_values_does_not_tell_a_black_box_from_others(tmp_path):
+    identity = lambda **options: Identity(fun=sd.black_box(np.sin, **options))
+    plain = identity()
+    assert not plain.differing(identity(store=tmp_path / "s.db", retries=2).parts)
+    assert not plain.differing(identity(out=0.0).parts)
+    assert not identity(out=0.0).differing(plain.parts)
+    assert identity(out=0.0).differing(identity(out=np.zeros(1)).parts) == {"fun.calls.promise"}
 
 
 def test_where_it_stands_what_it_is_called_and_comments_do_not_count():

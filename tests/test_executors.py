@@ -3,8 +3,10 @@
 import concurrent.futures
 import os
 import signal
+import sys
 import threading
 import time
+from concurrent.futures.process import BrokenProcessPool
 
 import host_functions
 import jax
@@ -82,6 +84,19 @@ def test_what_a_worker_cannot_import_ends_the_run(workers):
         sd.black_box(local, 0.0, executor=workers, on_error="nan")(1.0)
 
 
+def decorated(x):
+    return x
+
+
+@pytest.mark.parametrize("ours", [True, False])
+def test_a_decorator_hides_a_function_from_processes(ours, workers, monkeypatch):
+    with concurrent.futures.ProcessPoolExecutor(1) as pool:  # which begins none
+        f = sd.black_box(decorated, 0.0, executor=workers if ours else pool)
+        monkeypatch.setattr(sys.modules[__name__], "decorated", f)
+        with pytest.raises(sd.BlackBoxError, match=r"decorator .* f = sd.black_box\(decorated,"):
+            f(1.0)
+
+
 def test_the_number_of_processes():
     with pytest.raises(ValueError, match=r"workers=0: .* 1 or more"):
         sd.Processes(0)
@@ -93,6 +108,23 @@ def test_processes_that_were_shut_down():
     workers.shutdown()
     with pytest.raises(sd.BlackBoxError, match=r"takes no more calls, make a new one.*shut"):
         box(workers)(0.0)
+
+
+@pytest.mark.parametrize("broken", [BrokenProcessPool, concurrent.futures.BrokenExecutor])
+def test_a_function_that_raises_what_a_broken_pool_raises_loses_its_own_call(broken):
+    """As one that has a pool of its own."""
+
+    def host(x):
+        if x == 1:
+            raise broken("the function's own")
+        return 2 * x
+
+    with concurrent.futures.ThreadPoolExecutor(2) as pool:
+        f = sd.black_box(host, 0.0, executor=pool, on_error="nan", retries=1)
+        np.testing.assert_array_equal(jax.vmap(f)(jnp.arange(3.0)), [0.0, np.nan, 4.0])
+        f = sd.black_box(host, 0.0, executor=pool)
+        with pytest.raises(sd.BlackBoxError, match=rf"sample 1 of 3: raised {broken.__name__}: "):
+            awaited(jax.vmap(f), jnp.arange(3.0))
 
 
 def test_a_broken_pool_of_others_names_the_calls_that_may_have_done_it():

@@ -446,6 +446,23 @@ def test_a_run_that_goes_on_near_its_end_counts_as_before(path):
         np.testing.assert_array_equal(again.y, whole.y)
 
 
+@pytest.mark.parametrize("out", [None, 0.0])
+def test_a_finished_run_that_is_called_again_pays_for_its_check_alone(out, path):
+    calls = []
+    host = lambda y: np.float32(calls.append(1) or np.sum(np.floor(8 * np.abs(y - 1))))
+
+    def run():
+        calls.clear()
+        box = sd.black_box(host, out)  # as in a process of its own
+        fun, y0 = lambda y, args: box(y), jnp.zeros(2)
+        return sd.minimise(fun, y0, key=KEY, max_evaluations=20, checkpoint=path), len(calls)
+
+    (first, paid), (again, more) = run(), run()
+    assert (paid, more) == (20, 2 if out is None else 1)
+    pick = lambda r: (r.fun, r.smoothed, r.evaluations, r.reason, *r.y.tolist())
+    assert pick(again) == pick(first)
+
+
 def test_a_trial_that_showed_noise_is_of_the_run_that_it_ended(path):
     """A longer run judges the point that is lowest then."""
     rng = np.random.default_rng(0)

@@ -7,8 +7,10 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import host_functions
 import jax
 import jax.numpy as jnp
@@ -133,6 +135,40 @@ def test_nodes_that_a_file_cannot_have(path):
         assert got == Pair(2.0, 2.0)
     assert len(host.calls) == 1
     assert sd.load_store(path) == [(tuple(Pair(1.0, 2.0)), tuple(Pair(2.0, 2.0)))]
+
+
+class Moded:
+    """An array and a setting, of which its text says nothing."""
+
+    def __init__(self, x, mode):
+        self.x, self.mode = x, mode
+
+    def __repr__(self):
+        return f"{self.x}"
+
+
+jax.tree_util.register_pytree_node(
+    Moded, lambda node: ((node.x,), node.mode), lambda mode, leaves: Moded(*leaves, mode)
+)
+
+
+class Curve(eqx.Module):
+    x: jax.Array
+    of: Callable = eqx.field(static=True)
+
+
+def test_arguments_that_differ_in_static_data_are_other_points(path):
+    calls, times = [], lambda k: lambda x: k * x
+    mode = lambda node: np.float32(calls.append(1) or node.x * node.mode)
+    function = lambda curve: np.float32(calls.append(1) or curve.of(curve.x))
+    other = path.with_name("other.db")
+    for paid in (4, 0):
+        calls.clear()
+        f, g = sd.black_box(mode, 0.0, store=path), sd.black_box(function, 0.0, store=other)
+        assert [float(f(Moded(1.0, k))) for k in (1, 2)] == [1.0, 2.0]
+        assert [float(g(Curve(jnp.ones(()), times(k)))) for k in (1, 2)] == [1.0, 2.0]
+        assert len(calls) == paid
+    assert len(sd.load_store(path)) == len(sd.load_store(other)) == 2
 
 
 def test_arguments_of_other_types_and_bits_are_other_points(path, x64):
@@ -319,6 +355,56 @@ def test_what_calls_change_is_nothing_of_the_function(path):
     for x in (1.0, 2.0, 1.0):
         assert sd.black_box(host, 0.0, store=path)(x) == x + 1
     assert count == 2
+
+
+class Scaled:
+    """Has a setting that can change in place."""
+
+    def __init__(self, k):
+        self.k = k
+
+    def __call__(self, x):
+        return self.k * x
+
+
+def test_values_of_a_function_that_differs_are_not_added(path):
+    box = lambda k: sd.black_box(Scaled(k), 0.0, store=path)
+    assert box(2.0)(1.0) == 2.0
+    other = box(3.0)
+    with pytest.warns(RuntimeWarning, match=r"fun.k was another; .* none are added: name another"):
+        assert other(1.0) == 2.0
+    assert other(5.0) == 15.0
+    assert box(2.0)(5.0) == 10.0
+    assert stored(path) == {1.0: 2.0, 5.0: 10.0}
+
+
+def test_a_function_that_changes_between_calls_is_another(path):
+    k, scaled = 2.0, Scaled(2.0)
+    f = jax.jit(sd.black_box(lambda x: k * x, 0.0, store=path))
+    g = jax.jit(sd.black_box(scaled, 0.0, store=path.with_name("g.db")))
+    assert (awaited(f, 1.0), awaited(g, 1.0)) == (2.0, 2.0)
+    k = scaled.k = 3.0
+    with pytest.raises(ValueError, match=r"fun.k was another: name another file"):
+        awaited(f, 5.0)
+    with pytest.warns(RuntimeWarning, match=r"fun.k was another"):
+        assert awaited(g, 5.0) == 15.0
+    k = scaled.k = 2.0
+    assert (awaited(f, 5.0), awaited(g, 5.0)) == (10.0, 10.0)
+    assert stored(path) == stored(path.with_name("g.db")) == {1.0: 2.0, 5.0: 10.0}
+
+
+def test_a_late_change_by_the_calls_is_nothing_of_the_function(path):
+    fails, values = 0, []
+
+    def host(x):
+        nonlocal fails
+        fails += bool(x > 2)
+        return x
+
+    f = jax.jit(sd.black_box(host, 0.0, store=path))
+    for x in (1.0, 2.0, 3.0, 4.0):
+        values.append(awaited(f, x))
+    assert (values, fails, len(stored(path))) == ([1.0, 2.0, 3.0, 4.0], 2, 4)
 
 
 @pytest.mark.parametrize("content", [b"not a store at all" * 100, b"SQLite format 3"])
