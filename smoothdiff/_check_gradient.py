@@ -13,8 +13,9 @@ from jaxtyping import Array, Float, PyTree
 from smoothdiff._numbers import inexact
 from smoothdiff._params import Params, as_key, take_apart
 
-# a gradient that is known to this share of its largest entry is known well enough
-_ENOUGH = 0.1
+# a gradient that is known to this share of its largest entry is known well enough; where it nearly
+# vanishes, as in a minimum, to this share of that of single points
+_ENOUGH, _NEARLY = 0.1, 0.01
 # pairs for each parameter from which on a linear fit to them is better than none
 _EACH = 2
 # the fewest evaluations whose spread says something
@@ -28,7 +29,7 @@ class GradientCheck:
     Attributes:
         wrong: where the gradient differs from that of the function by more than chance allows.
         undecided: where it may be right, but is known to no better than a tenth of the largest
-            entry; more samples decide.
+            entry, nor a hundredth of what it is at single points; more samples decide.
         difference: the gradient less that of the function, both smoothed.
         low: the lower end of the interval of `difference`.
         high: the upper end.
@@ -150,7 +151,7 @@ def check_gradient(
     if params.free:
         raise ValueError("a leaf of y has no sigma: leave out of y what is not checked")
     z = jax.random.normal(as_key(key), (pairs, params.theta.size), params.theta.dtype)
-    values, gradients, rounding = _evaluated(grad_fun, fun, params, z)
+    values, gradients, rounding, usual = _evaluated(grad_fun, fun, params, z)
     u = np.asarray(z, float)
     slopes = _slopes(values, gradients, u)
     sampled = slopes + (values - np.sum(u * slopes, axis=1))[:, None] * u
@@ -165,7 +166,8 @@ def check_gradient(
     half = stdtrit(count - 1, 1 - level / (2 * n)) * stderr + rounding
     wrong = np.abs(mean) > half
     scale = max(np.max(np.abs(true)), np.max(np.abs(np.mean(gradients, axis=0))))
-    undecided = ~wrong & (half > _ENOUGH * scale)
+    # of what agrees to the last bit nothing more can be known
+    undecided = ~wrong & (half > max(_ENOUGH * scale, _NEARLY * usual)) & np.any(off != 0, axis=0)
 
     leaves, treedef = jax.tree.flatten(y)
     ends = np.cumsum([leaf.size for leaf in leaves])
@@ -210,9 +212,10 @@ def _slopes(
 
 def _evaluated(
     grad_fun: Callable, fun: Callable, params: Params, z: Float[Array, "m n"]
-) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"], float]:
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"], float, float]:
     """Half of the difference of each pair, the mean of both gradients, and what rounding may be.
 
+    And how large the gradient is at a point, in the root of its mean square, the largest entry.
     In units of sigma. One call after the other, outside of any transform, so that functions of all
     kinds will do.
     """
@@ -228,10 +231,12 @@ def _evaluated(
         leaves = [np.ravel(np.asarray(leaf, float)) for leaf in jax.tree.leaves(slope)]
         slopes.append(np.concatenate(leaves))
     pairs = np.reshape(values, (-1, 2))
-    gradients = np.reshape(slopes, (*pairs.shape, -1)).mean(axis=1)
+    width = np.asarray(params.sigma, float)
+    each = np.reshape(slopes, (*pairs.shape, -1)) * width
+    usual = float(np.max(np.sqrt(np.mean(each**2, axis=(0, 1)))))
     rounding = 8 * float(jnp.finfo(params.theta.dtype).eps) * np.max(np.abs(pairs))
     half = (pairs[:, 0] - pairs[:, 1]) / 2
-    return half, gradients * np.asarray(params.sigma, float), float(rounding)
+    return half, each.mean(axis=1), float(rounding), usual
 
 
 def _check(value: Any, slope: PyTree, y: PyTree[Array]) -> None:

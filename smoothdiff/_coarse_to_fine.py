@@ -54,8 +54,11 @@ class CoarseToFine:
     """What `coarse_to_fine` found.
 
     Attributes:
-        levels: the result of each level that was reached, the coarsest first.
+        levels: the result of each search, the coarsest level's first. The finest level may have
+            two.
+        evaluations: of each level that was reached.
         cost: what all evaluations cost together, in evaluations of the finest level.
+        reason: why the search ended, as in `Result`; or "max_cost".
 
     Example:
         >>> import jax, jax.numpy as jnp, smoothdiff as sd
@@ -73,7 +76,9 @@ class CoarseToFine:
     """
 
     levels: tuple[Result, ...]
+    evaluations: tuple[int, ...]
     cost: float
+    reason: str
 
     @property
     def y(self) -> PyTree:
@@ -84,16 +89,6 @@ class CoarseToFine:
     def fun(self) -> float:
         """The value there of that level's function."""
         return self.levels[-1].fun
-
-    @property
-    def reason(self) -> str:
-        """Why the search ended there."""
-        return self.levels[-1].reason
-
-    @property
-    def evaluations(self) -> tuple[int, ...]:
-        """Of each level."""
-        return tuple(result.evaluations for result in self.levels)
 
 
 def coarse_to_fine(
@@ -168,16 +163,18 @@ def coarse_to_fine(
     for level, dearer in itertools.pairwise(levels):
         stall = _Stall(_patience(level, dearer, y0), callback)
         found = search.run(level, y, callback=stall)
-        if stall.asked or found.reason in _ENDED or not search.room(dearer, y0):
-            return search.found()
+        if stall.asked or found.reason in _ENDED:
+            return search.found(found.reason)
+        if not search.room(dearer, y0):
+            return search.found("max_cost")
         y = found.y
         search.narrower(level.cost / dearer.cost)
     found = search.run(levels[-1], y, callback=callback, target=target)
     again = len(levels) > 1 and search.room(levels[-1], y0, search.looks) and found.reason in _WELL
     # one that was led astray
     if again and search.lower(levels[-1], y0):
-        search.run(levels[-1], y0, callback=callback, target=target)
-    return search.found()
+        found = search.again(levels[-1], y0, callback=callback, target=target)
+    return search.found(found.reason)
 
 
 @dataclasses.dataclass
@@ -200,7 +197,7 @@ class _Stall:
 
 @dataclasses.dataclass
 class _Search:
-    """A search in progress: the results so far, what they cost, and the options from now on."""
+    """A search in progress: what was found, what it cost, and the options from now on."""
 
     minimiser: Callable[..., Result]
     unit: float
@@ -210,6 +207,7 @@ class _Search:
     max_seconds: float | None
     options: dict[str, Any]
     results: list[Result] = dataclasses.field(default_factory=list)
+    counts: list[int] = dataclasses.field(default_factory=list)
     cost: float = 0.0
     start: float = dataclasses.field(default_factory=time.monotonic)
 
@@ -228,9 +226,21 @@ class _Search:
                 f"max_cost={self.max_cost} leaves no room for a step of the coarsest level: allow "
                 "more"
             ) from error
-        self.cost += found.evaluations * level.cost / self.unit
         self.results.append(found)
+        self.counts.append(0)
+        self._paid(level, found.evaluations)
         return found
+
+    def again(self, level: Level, y: PyTree, **ends: Any) -> Result:
+        """Another search of the last level."""
+        found = self.run(level, y, **ends)
+        self.counts[-2:] = [sum(self.counts[-2:])]
+        return found
+
+    def _paid(self, level: Level, evaluations: int):
+        """Counts evaluations of the last level."""
+        self.counts[-1] += evaluations
+        self.cost += evaluations * level.cost / self.unit
 
     def room(self, level: Level, y: PyTree, more: int = 0) -> bool:
         """Whether a step of that level can be paid for, and so many evaluations more."""
@@ -266,14 +276,16 @@ class _Search:
     def _value(self, level: Level, y: PyTree, *key: jax.Array) -> float:
         """The function itself at a point, which is an evaluation more."""
         out = level.fun(jax.tree.map(jnp.asarray, y), self.args, *key)
-        self.cost += level.cost / self.unit
+        self._paid(level, 1)
         if not self._squares():
             return float(out)
         return sum(float(jnp.sum(leaf**2)) / 2 for leaf in jax.tree.leaves(out))
 
-    def found(self) -> CoarseToFine:
-        """What there is so far."""
-        return CoarseToFine(tuple(self.results), self.cost)
+    def found(self, reason: str) -> CoarseToFine:
+        """What there is so far, and why that is all."""
+        # of a level there is no other limit
+        reason = "max_cost" if reason == "max_evaluations" else reason
+        return CoarseToFine(tuple(self.results), tuple(self.counts), self.cost, reason)
 
     def _squares(self) -> bool:
         return isinstance(self.results[-1].solver, optx.AbstractLeastSquaresSolver)

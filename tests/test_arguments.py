@@ -250,3 +250,15 @@ def test_counts_may_be_integers_of_numpy(key):
     for bad in (np.int64(0), 16.0, np.float64(16), "16", None):
         with pytest.raises(ValueError, match="num_samples must be a positive integer"):
             g(bad, None)
+
+
+@pytest.mark.parametrize("static", [3, "sum"])
+def test_products_in_chunks_take_what_jax_cannot_trace(static, key):
+    def fun(how, x):
+        assert isinstance(how, int | str)
+        return jnp.sum(x**2)
+
+    run = lambda **chunks: sd.smooth_hvp(fun, 0.3, argnums=1, **chunks)(
+        key, static, jnp.ones(2), jnp.ones(2)
+    )
+    np.testing.assert_allclose(run(batch_size=8), run(), rtol=1e-4)

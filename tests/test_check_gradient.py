@@ -156,3 +156,14 @@ def test_wrong_arguments_say_what_to_write(changed, message):
     check = as_users_have_it(sd.check_gradient)
     with pytest.raises(ValueError, match=message):
         check(**usual, key=jax.random.key(0))
+
+
+@pytest.mark.parametrize(
+    "fun", [lambda y: jnp.sum(y**2), lambda y: 1 + jnp.sum(jnp.cos(y)), lambda y: 3.0 + 0 * y[0]]
+)
+def test_a_gradient_that_vanishes_can_pass(fun, key):
+    right = jax.jit(jax.grad(fun))
+    check = lambda grad: sd.check_gradient(grad, jax.jit(fun), jnp.zeros(2), 0.1, key=key)
+    assert check(right).passed
+    found = check(lambda y: right(y) + jnp.array([0.1, 0.0]))
+    assert list(found.wrong) == [True, False]

@@ -78,9 +78,7 @@ def test_all_evaluations_are_counted_and_paid_for():
     found = sd.coarse_to_fine(sd.least_squares, levels, jnp.array([3.0, 3.0]), key=KEY)
     np.testing.assert_allclose(found.y, [1, -2], atol=1e-3)
     calls = [each.calls for each in counted]
-    assert list(found.evaluations[:2]) == calls[:2]
-    # the start is evaluated once more at the end
-    assert found.evaluations[2] + 1 == calls[2]
+    assert list(found.evaluations) == calls  # the start's once more at the end
     assert found.cost == pytest.approx(calls[0] / 64 + calls[1] / 16 + calls[2])
 
 
@@ -136,6 +134,39 @@ def test_a_target_a_callback_and_a_time_end_it():
     assert (found.reason, len(found.levels)) == ("callback", 1)
     assert 3 <= found.evaluations[0] <= 4  # one to judge it
     assert run(max_seconds=0.0).reason == "max_seconds"
+
+
+def test_it_says_that_the_finest_level_was_too_dear():
+    coarse = sd.Level(lambda y, args: (y - 0.1) ** 2, 1.0)
+    fine = sd.Level(lambda y, args: (y - 0.7) ** 2, 10.0)
+    run = lambda cost: sd.coarse_to_fine(
+        sd.minimise, [coarse, fine], 0.65, key=KEY, bounds=(0.0, 1.0), max_cost=cost
+    )
+    found = run(8.0)
+    assert (found.reason, len(found.levels)) == ("max_cost", 1)
+    found = run(13.0)
+    assert (found.reason, len(found.evaluations)) == ("max_cost", 2)
+
+
+def test_a_level_that_is_searched_twice_is_counted_as_one():
+    """The coarse minimum leads astray: the fine function is lowest at the start."""
+    calls = [0, 0]
+
+    def level(i, fun):
+        def host(y):
+            calls[i] += 1
+            return np.float32(fun(y))
+
+        box = sd.black_box(host, 0.0)
+        return sd.Level(lambda y, args: box(y), (1.0, 10.0)[i])
+
+    hole = lambda y: 10 * (y - 0.7) ** 2 if abs(y - 0.7) < 0.1 else 1 + (y - 0.1) ** 2
+    levels = [level(0, lambda y: (y - 0.1) ** 2), level(1, hole)]
+    found = sd.coarse_to_fine(sd.minimise, levels, 0.65, key=KEY, bounds=(0.0, 1.0))
+    assert len(found.levels) == 3
+    np.testing.assert_allclose(found.y, 0.7, atol=1e-2)
+    assert list(found.evaluations) == calls
+    assert found.cost == pytest.approx(calls[0] / 10 + calls[1])
 
 
 @pytest.mark.slow

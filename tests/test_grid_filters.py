@@ -331,3 +331,8 @@ def test_what_is_switched_off_is_not_computed():
     assert "sqrt" not in plain  # one channel has no norm
     column = str(jax.make_jaxpr(cross_bilateral(0.1, 1, ndim=2))(signal[:1], signal[:1]))
     assert column.count("custom_jvp_call") == 2  # an axis of one pixel has no taps
+
+
+@pytest.mark.parametrize("shape", [(0, 4), (4, 0), (4, 4, 0)])
+def test_laplacian_of_nothing_is_nothing(shape):
+    assert laplacian(3.0, ndim=2)(jnp.zeros(shape), None).shape == shape

@@ -105,6 +105,23 @@ def test_power_is_applying_it_again(body, x64):
     assert_same(found, again, jnp.float64)
 
 
+@pytest.mark.parametrize("weights", ["uniform", "cotangent"])
+def test_the_size_of_a_signal_does_not_matter(weights):
+    """Nor that of the other channels: the second moment of a small gradient is tiny."""
+    positions, faces = icosphere(2)
+    guide = jnp.asarray(positions, jnp.float32)
+    smooth = jax.jit(mesh_laplacian(faces, LAM, weights=weights))
+    signal = jnp.asarray(noise(positions), jnp.float32)[:, :1]
+    expected = smooth(signal, guide)[:, 0]
+    scales = jnp.array([1e-25, 1e-18, 1e-13, 1e-6, 1.0, 1e18, 1e30], jnp.float32)
+    found = smooth(signal * scales[None], guide) / scales[None]
+    for column in found.T:
+        np.testing.assert_allclose(column, expected, rtol=1e-4, atol=1e-6)
+    half = smooth(signal.astype(jnp.float16), guide.astype(jnp.float16))
+    assert half.dtype == jnp.float16
+    np.testing.assert_allclose(half[:, 0].astype(jnp.float32), expected, atol=5e-3)
+
+
 def test_a_signal_may_be_numpys():
     positions, faces = MESHES["triangle"]
     smooth = mesh_laplacian(faces, LAM)

@@ -11,6 +11,7 @@ import pytest
 from benchmarks.scenes import shadow
 from smoothdiff._host_samples import BlackBoxError
 from smoothdiff.renderers import mitsuba
+from smoothdiff.renderers._mitsuba_scene import mitsuba_with
 
 mi.set_variant("scalar_rgb")
 T = mi.ScalarTransform4f
@@ -326,7 +327,7 @@ def test_only_what_changed_is_updated(monkeypatch):
 
     monkeypatch.setattr(mi.SceneParameters, "__setitem__", spy)
     render({"ball.translate": jnp.zeros(3), "cube.scale": 1.0})
-    assert len(told) == 4  # the film, the ball, and positions and normals of the cube
+    assert len(told) == 6  # the film's window, the ball, and positions and normals of the cube
     for shift, expected in ((0.1, ["ball.to_world"]), (0.1, []), (0.2, ["ball.to_world"])):
         told.clear()
         render({"ball.translate": jnp.full(3, shift), "cube.scale": 1.0})
@@ -550,3 +551,29 @@ def test_the_shadow_is_seen_from_every_start_and_found_only_at_the_reference():
                 picture = np.asarray(see(y))
                 assert (picture.max(axis=-1) < 0.2 * lit).sum() >= 4
                 assert loss(picture) > 10 * best or np.hypot(*(y - shadow.REFERENCE)) < 0.2
+
+
+def test_a_crop_window_is_kept():
+    """At another resolution and after it, of one loaded scene."""
+    film = {"type": "hdrfilm", "width": 32, "height": 32}
+    film |= {"crop_width": 8, "crop_height": 16, "crop_offset_x": 12, "crop_offset_y": 8}
+    with mitsuba_with("scalar_rgb"):
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "ball": {"type": "sphere"},
+                "sky": {"type": "constant"},
+                "camera": {"type": "perspective", "fov": 60, "film": film},
+            },
+            optimize=False,
+        )
+    away, options = jnp.array([0.5, 0.5, 5.0]), {"integrator": "direct", "spp": 4}
+    render = lambda **more: mitsuba.renderer(scene, "ball.translate", **options, **more)
+    own = render()
+    seen = own(away)
+    assert seen.shape == (16, 8, 3)
+    np.testing.assert_allclose(render(resolution=(16, 8))(away), seen, rtol=1e-5)
+    finer = render(resolution=(32, 16))(away)
+    blocks = finer.reshape(16, 2, 8, 2, 3).mean(axis=(1, 3))
+    assert np.mean(np.abs(blocks - seen)) < 0.2 * np.mean(np.abs(seen - np.mean(seen)))
+    np.testing.assert_allclose(own(away), seen, rtol=1e-5)

@@ -87,3 +87,18 @@ def test_bad_input():
         sd.newton_step(-1.0)
     with pytest.raises(ValueError, match="value_fn"):
         sd.newton_step(1.0).update(jnp.zeros(2), optax.EmptyState(), jnp.zeros(2))
+
+
+def test_the_radius_may_be_traced():
+    optim = optax.inject_hyperparams(sd.newton_step)(radius=0.5)
+    y = jnp.zeros(2)
+    state = optim.init(y)
+
+    @jax.jit
+    def step(radius):
+        hyperparams = state.hyperparams | {"radius": radius}
+        grad, now = jax.grad(bowl)(y), state._replace(hyperparams=hyperparams)
+        return optim.update(grad, now, y, value_fn=bowl)[0]
+
+    np.testing.assert_allclose(y + step(0.5), stepped(bowl, y, 0.5), rtol=1e-6)
+    assert np.all(np.isnan(step(-0.5)))

@@ -200,3 +200,30 @@ def test_both_precisions(dtype):
     advice = recommend(bowl, jnp.ones(2), key=KEY)
     assert advice.sigma.dtype == dtype
     assert said(advice.seen, "smooth")
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e30])
+def test_the_scale_of_the_function_does_not_matter(scale):
+    y0 = jnp.array([0.5, 1.0])
+    usual = recommend(bowl, y0, key=KEY)
+    found = recommend(lambda y, _: scale * bowl(y, _), y0, key=KEY)
+    assert (len(found.seen), found.seen[-1], found.advice) == (
+        len(usual.seen),
+        usual.seen[-1],
+        usual.advice,
+    )
+
+
+def test_where_no_neighbour_has_a_value_nothing_is_called_a_plateau():
+    y0 = jnp.array([0.5, 1.0])
+    found = recommend(lambda y, _: jnp.where(jnp.all(y == y0), 1.0, jnp.nan), y0, key=KEY)
+    assert "plateau" not in str(found)
+    assert "not finite" in str(found)
+
+
+@pytest.mark.parametrize("start", [0, 1])
+def test_a_whole_number_of_two_matters_from_either_side(start):
+    space = {"k": sd.Integer(0, 1), "x": sd.Range(0, 1)}
+    fun = lambda y, _: (y["x"] - 0.3) ** 2 + jnp.where(y["k"] > 0, 1.0, 0.0)
+    found = recommend(fun, {"k": start, "x": 0.8}, key=KEY, space=space)
+    assert "k 1," in str(found)

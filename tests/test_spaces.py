@@ -182,6 +182,15 @@ def test_periodic_goes_round_without_a_jump(dtype):
     np.testing.assert_allclose(space.to_natural(space.to_unit(-100.0)), -100, rtol=1e-5)
 
 
+@pytest.mark.parametrize("count", [2, 3, 4, 50])
+def test_within_a_default_width_a_whole_number_has_neighbours(count):
+    space = sd.Integer(1, count)
+    for start in (1, count):
+        u = space.to_unit(start)
+        ends = jnp.clip(jnp.asarray([u - space.width(), u + space.width()]), 0, 1)
+        assert np.any(space.to_natural(ends) != start)
+
+
 def test_default_widths():
     assert sd.Range(3, 9).width() == 0.2
     assert sd.Range(1, 9, log=True).width(0.4) == 0.4
@@ -189,9 +198,9 @@ def test_default_widths():
     assert sd.Periodic().width(0.4) == 0.1
     assert sd.Positive().width(0.4) == math.log(2)
     assert sd.Integer(0, 99).width() == 0.2
-    assert sd.Integer(0, 1).width() == 0.25  # half an interval
-    np.testing.assert_array_equal(sd.Integer(0, [1, 99]).width(0.2), [0.25, 0.2])
-    np.testing.assert_array_equal(sd.Integer(0, [1, 99]).width(0.4), 0.4)
+    assert sd.Integer(0, 1).width() == 0.5  # an interval
+    np.testing.assert_array_equal(sd.Integer(0, [1, 99]).width(0.2), [0.5, 0.2])
+    np.testing.assert_array_equal(sd.Integer(0, [1, 99]).width(0.4), [0.5, 0.4])
     assert sd.Range(0, 1, sigma=[0.1, 0.3]).width(0.4) == (0.1, 0.3)
 
 

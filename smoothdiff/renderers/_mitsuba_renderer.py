@@ -23,6 +23,9 @@ from smoothdiff.renderers._mitsuba_scene import (
     scene_values,
 )
 
+# What says how many pixels a film has, and which of them are rendered.
+_WINDOW = "size", "crop_size", "crop_offset"
+
 
 def renderer(
     scene: Any,
@@ -64,7 +67,8 @@ def renderer(
         axis: Direction in world space that `"NAME.rotate"` turns about, anti-clockwise for a viewer
             that it points at; or a dict from object to direction, `{"mug": (0, 0, 1)}`. Others
             turn about any.
-        resolution: Pixels, `(height, width)` or the side of a square. None: as the scene says.
+        resolution: Pixels, `(height, width)` or the side of a square. None: as the scene says. A
+            film with a crop window has that window, scaled, to whole pixels.
         spp: Samples per pixel. None: as the scene says.
         integrator: The type of a Mitsuba integrator, such as `"direct"`, a dict as for
             `mitsuba.load_dict`, or a loaded integrator. None: as the scene says.
@@ -281,4 +285,11 @@ def _films(
     height, width = np.broadcast_to(resolution, 2).tolist()
     if not (operator.index(height) > 0 and operator.index(width) > 0):
         raise ValueError(f"resolution must be positive, not {resolution}")
-    return {f"{film}.size": np.array([width, height]) for film in films}, (height, width, 3)
+    wanted = np.array([width, height])
+    values = {}
+    for film in films:
+        scale = wanted / loaded.initial(f"{film}.crop_size")
+        # told of the size alone, Mitsuba would take the whole film
+        for name in (f"{film}.{part}" for part in _WINDOW):
+            values[name] = np.round(scale * loaded.initial(name)).astype(int)
+    return values, (height, width, 3)
