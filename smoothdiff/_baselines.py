@@ -112,7 +112,8 @@ class Mean(AbstractBaseline):
     N/(N-1), the Hessian by (N-2)/(N-1). A set that is a single group has no others, and then
     nothing is subtracted. For a single scrambled point set it is the plain mean: leaving samples
     out of an even set makes it uneven, a bias of 14 % at N = 8 where that of the mean is not seen.
-    It is seen if the points of the one set are weighted (`Aggregate` with `quasi=True`).
+    It is seen if the points of the one set are weighted (`Aggregate` with `quasi=True`), and in the
+    Hessian if they are mirrored (`Sobol(antithetic=True)`).
     """
 
     def __call__(self, values, draws, log_ratio, valid, center):

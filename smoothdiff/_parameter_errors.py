@@ -86,8 +86,8 @@ class ParameterErrors:
             )
         elif np.any(unknown):
             said.append(
-                f"no error of {_listed(names[unknown])}: the evaluations do not tell how the "
-                "residuals depend on them. "
+                f"no error of {_listed(names[unknown])}, and the others are for them as they are: "
+                "the evaluations do not tell how the residuals depend on them. "
                 + _why(bool(answer.more), 2 * int(np.sum(~fixed)), takes_key)
             )
         if said:

@@ -203,6 +203,15 @@ class AbstractPointSearch(eqx.Module):
         newest = min(_COMING * count, len(valid) - 1)
         return (self.evaluated < count) | jnp.any(valid[-newest:]) | first
 
+    def at_edge(self) -> Bool[Array, ""]:
+        """Whether more evaluations of those in the history than parameters have no value.
+
+        Once or twice a step may just have gone too far, and a shorter one is all it takes.
+        """
+        valid = self.history.valid
+        known = jnp.minimum(self.evaluated, len(valid))
+        return known - jnp.sum(valid, dtype=known.dtype) > len(self.start)
+
     def converged(self) -> Bool[Array, ""]:
         """Whether the last steps were small."""
         return self.small >= _SMALL

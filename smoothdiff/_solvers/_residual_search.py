@@ -204,7 +204,7 @@ class ResidualSearch(AbstractLookingSearch):
         here = self.history.best(self.start)
         # what the radius learns of a step that failed is that it failed
         barred = new.barred(here[1], here[2], jnp.max(proposal.reduction), squares=True)
-        with_rows = self.kept(where(self.is_local(), barred, new))
+        with_rows = self.kept(where(self.is_local() & self.at_edge(), barred, new))
         branches = [
             lambda: with_rows._after_first(
                 params, jnp.where(new.valid, new.funs, jnp.inf)

@@ -92,7 +92,7 @@ class ValueSearch(ValueState):
         """The search with these new evaluations."""
         _, row, before = self.history.best(self.start)
         barred = new.barred(row, before, jnp.max(proposal.reduction), squares=False)
-        new = where(self.is_local(), barred, new)
+        new = where(self.is_local() & self.at_edge(), barred, new)
         known = self.kept(new)
         known = eqx.tree_at(lambda s: s.turn, known, self.turn.more(sizes.step))
 

@@ -59,10 +59,11 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
       lead nowhere the center goes back to the best point.
 
     With `nonfinite="drop"`, where both first points of a parameter fail, nearer ones follow, and so
-    they do after a round of samples that all fail. A step that fails counts as a little higher than
-    the best point, so the model turns away from there. A parameter whose first points had the value
-    of the start, and whose sigma is below a thousandth of the largest, has farther ones. Else it
-    keeps no run going. In the end it is back at the start, if that raises nothing.
+    they do after a round of samples that all fail. After n failures a step that fails counts as a
+    little higher than the best point, so the model turns away from there. A parameter whose first
+    points had the value of the start, and whose sigma is below a thousandth of the largest, has
+    farther ones. Else it keeps no run going. In the end it is back at the start, if that raises
+    nothing.
 
     M, the metric of both, takes the shape of the Hessian, directions included up to 64 parameters.
     So sigma says where to begin.
