@@ -243,7 +243,7 @@ class Run:
             advice += _OVERFLOW.format(dtype)
         return MinimiseError(_NONFINITE + advice, self.found("nonfinite", progress))
 
-    def failed(self, error: Exception) -> MinimiseError:
+    def failed(self, error: BaseException) -> MinimiseError:
         """What to raise where a black box failed, as it may at points that nothing keeps out."""
         anywhere = self.problem.options.get("bounds") is None
         advice = _UNBOUNDED if anywhere and getattr(error, "at_point", False) else ""

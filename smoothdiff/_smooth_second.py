@@ -166,8 +166,8 @@ def smooth_hvp(
         args = (x, *other_args)
         call.params(key, args).layout.check_vector(v)
         target, v = jax.tree.map(jnp.asarray, (choose(args, call.argnums), v))
-        x, *other_args = replace(args, call.argnums, target)
-        return compiled(key, x, v, *other_args)
+        x, *others = replace(args, call.argnums, target)
+        return compiled(key, x, v, *others)
 
     return g
 

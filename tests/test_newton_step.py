@@ -92,7 +92,7 @@ def test_bad_input():
 def test_the_radius_may_be_traced():
     optim = optax.inject_hyperparams(sd.newton_step)(radius=0.5)
     y = jnp.zeros(2)
-    state = optim.init(y)
+    state: Any = optim.init(y)
 
     @jax.jit
     def step(radius):
