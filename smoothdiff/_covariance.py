@@ -30,6 +30,9 @@ _CURVED, _NOISY = 0.01, 0.5
 _SHARE, _CHANCE, _EXACT = 0.01, 16, 1e-12
 # sums with a parameter may be off by so many of its roundings
 _DIGITS = 8
+# errors of residuals below so many of their roundings may be those of rounding, which several
+# residuals share
+_ROUNDINGS = 64
 # residuals at a time, in float64
 _CHUNK = 65536
 
@@ -40,7 +43,7 @@ class Slopes(NamedTuple):
     `squares` is the sum over residuals of their slopes' products, and `noise` and `curved` what the
     two parts of the errors add to it. `scale` is the unit of each parameter. `even` is the square
     of the distance at which both parts are the same, that of parameters in their units or, if
-    `of_residuals`, that of residuals.
+    `of_residuals`, that of residuals. The noise may be that of `rounding` alone.
     """
 
     squares: Float[np.ndarray, "n n"]
@@ -49,6 +52,7 @@ class Slopes(NamedTuple):
     scale: Float[np.ndarray, " n"]
     even: float
     of_residuals: bool
+    rounding: bool
 
 
 class Covariance(NamedTuple):
@@ -81,7 +85,7 @@ def slopes(
     usual = np.median(np.mean(np.square(rows, dtype=float), axis=1))
     rounding = np.finfo(rows.dtype).eps ** 2 * max(usual, np.mean(rows[here].astype(float) ** 2))
     least = max(rounding, np.finfo(float).tiny)
-    best, found, even = -np.inf, None, (np.inf, False)
+    best, found, about = -np.inf, None, (np.inf, False, False)
     # curvature grows with the distance, by sigma or by what the residuals say
     for of_residuals, distances in ((False, np.sum(away**2, axis=1)), (True, np.diag(gram))):
         some = np.log(distances[distances > 0])
@@ -89,9 +93,10 @@ def slopes(
             continue
         for log in np.linspace(some.min() - _NEARER, some.max() + _FARTHER, _GRID):
             curved = (distances / np.exp(log)) ** 2
-            likelihood, fit = _regression(gram, away, curved, size, least)
+            likelihood, factor, fit = _regression(gram, away, curved, size, least)
             if likelihood > best:
-                best, found, even = likelihood, fit, (np.exp(log), of_residuals)
+                best, found = likelihood, fit
+                about = np.exp(log), of_residuals, factor < _ROUNDINGS**2 * least
     if found is None:
         return None
     squares, noise, curved = (np.zeros((len(scale), len(scale))) for _ in found)
@@ -101,7 +106,7 @@ def slopes(
     digits = _DIGITS * np.finfo(rows.dtype).eps * np.max(np.abs(points), axis=0) / scale
     noise += np.sum(np.diag(squares) * digits**2) * np.eye(len(scale))
     noise[~moved, ~moved] = 1
-    return Slopes(squares, noise, curved, scale, *even)
+    return Slopes(squares, noise, curved, scale, *about)
 
 
 def balance(known: Slopes, values: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
@@ -114,8 +119,8 @@ def balance(known: Slopes, values: Float[np.ndarray, " m"]) -> Float[np.ndarray,
 
 def _regression(
     gram: np.ndarray, away: np.ndarray, curved: np.ndarray, size: int, least: float
-) -> tuple[float, tuple[np.ndarray, np.ndarray, np.ndarray] | None]:
-    """The likelihood of errors of variance 1 + `curved`, but for a factor, and what they give."""
+) -> tuple[float, float, tuple[np.ndarray, np.ndarray, np.ndarray] | None]:
+    """The likelihood of errors of variance 1 + `curved`, but for a factor; that; what they give."""
     variance = 1 + curved
     root = 1 / np.sqrt(variance)
     design = np.concatenate([np.ones((len(away), 1)), away], axis=1) * root[:, None]
@@ -123,7 +128,7 @@ def _regression(
     left, values, right = np.linalg.svd(design / norm, full_matrices=False)
     freedom = len(away) - len(values)
     if freedom < 1 or values[-1] <= _RANK * values[0]:
-        return -np.inf, None
+        return -np.inf, 1.0, None
     weighted = gram * root[:, None] * root
     rest = weighted - left @ (left.T @ weighted)
     rest = rest - (rest @ left) @ left.T
@@ -132,7 +137,8 @@ def _regression(
     likelihood = -size / 2 * (freedom * np.log(factor) + logs)
     inverse = ((right.T / values @ left.T) / norm[:, None] * root)[1:]
     part = size * factor * inverse
-    return likelihood, (inverse @ gram @ inverse.T, part @ inverse.T, (part * curved) @ inverse.T)
+    noise, bend = part @ inverse.T, (part * curved) @ inverse.T
+    return likelihood, factor, (inverse @ gram @ inverse.T, noise, bend)
 
 
 def covariance(
@@ -153,7 +159,8 @@ def covariance(
     directions = back @ turn
     share = np.einsum("ik,ij,jk->k", directions, known.curved[at], directions)
     none = signal <= 1 / _NOISY
-    told = ~none & (signal > (share + (1 - share) / residuals) / _CURVED)
+    alike = 1 if known.rounding else share + (1 - share) / residuals
+    told = ~none & (signal > alike / _CURVED)
     part = directions[:, told]
     inner = part / (signal[told] - 1) @ part.T * (squares / freedom)
     # where there is no signal the parameters are taken as they are, where there is too little not

@@ -386,3 +386,22 @@ def test_leaves_of_two_precisions_have_errors(x64):
     for name in ("a", "b"):
         found, known = mixed.parameter_errors[name], double.parameter_errors[name]
         np.testing.assert_allclose(found, known, rtol=1e-3)
+
+
+def test_rounding_is_no_slope_of_what_changes_nothing_nearby(x64):
+    """Residuals have some of it in common, so that it may look like one."""
+    angle, whole = sd.Periodic(2 * np.pi), sd.Integer(0, 8)
+    space = {"a": sd.Positive(), "b": sd.Range(1e-3, 10, log=True), "c": angle, "k": whole}
+
+    def model(y):
+        swings = y["a"] * jnp.exp(-y["b"] * times()) * jnp.cos(3 * times() + y["c"])
+        return swings + 0.1 * jnp.asarray(y["k"], float) * times()
+
+    start, truth = ({"a": 1.0, "b": 0.1, "c": 0.1, "k": 1}, {"a": 2.0, "b": 0.5, "c": 0.4, "k": 3})
+    for seed in range(4):
+        data = noisy(model, truth, 0.05, jax.random.key(seed))
+        result = fitted(model, data, start, space=space)
+        with pytest.warns(UserWarning, match="no error of k, and the others are for them"):
+            errors = result.parameter_errors
+        assert np.isnan(errors["k"])
+        assert 0.005 < errors["a"] < 0.2
