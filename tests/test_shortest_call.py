@@ -542,3 +542,20 @@ def test_a_run_that_is_taken_up_goes_on_with_what_it_paid_for(tmp_path):
         )
     assert 10 < result.evaluations <= 14
     assert len(host.points) < 10
+
+
+def test_a_whole_number_and_a_slope_that_go_together():
+    """Alone the number raises the loss, and nearer it changes nothing: they step as one."""
+    times = jnp.linspace(0.0, 1.0, 20)
+
+    def residuals(y, seen):
+        return y["a"] * times + y["k"].astype(float) * times**2 - seen
+
+    space = {"a": sd.Range(0.0, 10.0), "k": sd.Integer(0, 8)}
+    for seed in range(4):
+        noise = 0.05 * jax.random.normal(jax.random.key(seed), times.shape)
+        seen = 2 * times + 3 * times**2 + noise
+        found = sd.least_squares(
+            residuals, {"a": 1.0, "k": 6}, seen, key=jax.random.key(seed), space=space
+        )
+        assert int(found.y["k"]) == 3

@@ -14,14 +14,12 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from smoothdiff._params import Params
-from smoothdiff._solvers._fall import Fall
-from smoothdiff._solvers._first_points import FARTHER, FirstPoints
+from smoothdiff._solvers._first_points import FARTHER
 from smoothdiff._solvers._history import History, alike
-from smoothdiff._solvers._looking_search import AbstractLookingSearch
-from smoothdiff._solvers._pilot import Pilot
+from smoothdiff._solvers._residual_state import ResidualState
 from smoothdiff._solvers._residual_trust import Proposal, TrustRegion
 from smoothdiff._solvers._stages import FIRST, TRUST, WIDE, Sizes, by_stage
 from smoothdiff._solvers._turns import Turn
@@ -30,114 +28,24 @@ from smoothdiff._solvers._wide_rounds import Wide, further, sides_of
 
 # around a lower point that wide rounds found the local model has a radius of so many widths
 _NARROWER = 0.1
-# so much of the loss at the start is much, where a search should end
-_MUCH = 0.1
 
 
-class ResidualSearch(AbstractLookingSearch):
-    """Where a search stands, with the local model and the wide one."""
-
-    trust: TrustRegion
-    wide: Wide
-    turn: Turn
-
-    @staticmethod
-    def of(theta: Float[Array, " n"], history: History) -> "ResidualSearch":
-        """Nothing is known but what is in the history."""
-        n, size = len(theta), history.rows.shape[1]
-        one, none = jnp.ones((), theta.dtype), jnp.zeros((), jnp.int32)
-        return ResidualSearch(
-            stage=jnp.asarray(FIRST, jnp.int32),
-            history=history,
-            start=theta,
-            evaluated=none,
-            first=FirstPoints.start(theta),
-            trust=TrustRegion.start(one, n, size),
-            wide=Wide.start(theta, jnp.zeros(size, theta.dtype), jnp.ones_like(theta)),
-            turn=Turn.start(n, one),
-            small=none,
-            fall=Fall.start(one),
-            pilot=Pilot.start(theta),
-            average=None,
-            look=None,
-        )
-
-    def again(
-        self,
-        params: Params,
-        theta: Float[Array, " n"],
-        start: Float[Array, " n"],
-        lowest: tuple[Float[Array, " n"], Float[Array, ""]],
-        key: Array,
-    ) -> "ResidualSearch":
-        """Another search, from elsewhere, with other random numbers."""
-        empty = jax.tree.map(jnp.zeros_like, self.history)
-        anew = ResidualSearch.of(theta, empty)
-        anew = dataclasses.replace(anew, look=self.look)
-        return eqx.tree_at(lambda s: s.wide.rounds, anew, self.wide.rounds + 1)
-
-    def elsewhere(self, params: Params, theta: Float[Array, " n"]) -> "ResidualSearch":
-        """Another search, with all that was evaluated."""
-        anew = ResidualSearch.of(theta, self.history)
-        anew = dataclasses.replace(anew, pilot=self.pilot, look=self.look)
-        return anew.widened(params, theta, jnp.ones_like(theta[0]))
-
-    def widened(
-        self, params: Params, theta: Float[Array, " n"], width: Float[Array, ""]
-    ) -> "ResidualSearch":
-        """With longer steps along the parameters, from a point that is known."""
-        first = self.first.around(self.history.best(theta)[2])
-        first = dataclasses.replace(first, reach=width * first.reach)
-        stage = jnp.full_like(self.stage, FIRST)
-        return eqx.tree_at(lambda s: (s.stage, s.start, s.first), self, (stage, theta, first))
-
-    def teaches(self) -> Bool[Array, ""]:
-        """A look; a check that comes true says as much as a small step."""
-        return self.is_looking()
-
-    def level(self) -> Bool[Array, ""]:
-        """One of the local model."""
-        return self.is_local() & self.trust.level
-
-    def lost(self, sizes: Sizes) -> Bool[Array, ""]:
-        """Whether it converged, or so many evaluations in a row were hardly lower."""
-        return self.converged() | (self.fall.since >= sizes.patience)
+class ResidualSearch(ResidualState):
+    """What is evaluated next, and what that teaches: a local model and a wide one."""
 
     def counted(self, small: Array, teaches: Array, last: Array, count: int) -> "ResidualSearch":
-        """Before the minimum of a ripple is taken for the answer, wide rounds look around once."""
+        """Before wide rounds have looked around once, two answers are in doubt.
+
+        That in a ripple, and one where a parameter that mattered does not any more, as of whole
+        numbers: it may take a step of several together.
+        """
         after = super().counted(small, teaches, last, count)
-        unseen = (self.wide.rounds == 0) & self.is_local() & self.trust.of_ripple()
-        doubt = after.converged() & unseen & self._much()
+        unseen = (self.wide.rounds == 0) & self.is_local()
+        ripple = self.trust.of_ripple() & self.much()
+        doubt = after.converged() & unseen & (ripple | self.stands_still())
         around = after._to_wide(jnp.ones_like(self.wide.scale))
         around = eqx.tree_at(lambda s: s.small, around, jnp.zeros_like(self.small))
         return where(doubt, around, after)
-
-    def is_good(self) -> Bool[Array, ""]:
-        """Where little of the loss is left, no other minimum is much lower."""
-        return ~self._much()
-
-    def _much(self) -> Bool[Array, ""]:
-        return self.history.best(self.start)[2] > _MUCH * self.first.before
-
-    def round(self) -> Int[Array, ""]:
-        """So many wide rounds."""
-        return self.wide.rounds
-
-    def numbers(self) -> Int[Array, ""]:
-        """In rounds each sample has a key of its own, as its residuals are not compared."""
-        return jnp.where(self.stage == WIDE, self.evaluated, 0)
-
-    def smoothing(self) -> Float[Array, ""]:
-        """Half the squares of what the linear model adds."""
-        return jnp.sum((self.trust.jacobian * self.length()[:, None]) ** 2) / 2
-
-    def length(self) -> Float[Array, " n"]:
-        """The radius, or the width of the samples."""
-        return jnp.where(self.stage == WIDE, self.wide.scale, self.trust.radius)
-
-    def _scaled(self, params: Params) -> Params:
-        """With a smaller sigma where the first points said so."""
-        return dataclasses.replace(params, sigma=params.sigma * self.first.reach)
 
     def propose(
         self,
@@ -147,7 +55,7 @@ class ResidualSearch(AbstractLookingSearch):
         stage: int | None = None,
     ) -> tuple[Float[Array, "K n"], Proposal]:
         """The first points, the end of a step, or the next samples of a round."""
-        params = self._scaled(params)
+        params = self.scaled(params)
         sigma = params.sigma
         count, n = sizes.step, len(sigma)
         slot = jnp.arange(count, dtype=jnp.int32)
@@ -200,7 +108,7 @@ class ResidualSearch(AbstractLookingSearch):
         stage: int | None = None,
     ) -> "ResidualSearch":
         """The search with these residuals at these points."""
-        params = self._scaled(params)
+        params = self.scaled(params)
         here = self.history.best(self.start)
         # what the radius learns of a step that failed is that it failed
         barred = new.barred(here[1], here[2], jnp.max(proposal.reduction), squares=True)
@@ -234,7 +142,10 @@ class ResidualSearch(AbstractLookingSearch):
         too_near = self.too_near(params.sigma)
         first = where(first.done() & jnp.any(too_near), first.again(too_near, FARTHER), first)
         stage = jnp.where(first.done(), TRUST, FIRST).astype(self.stage.dtype)
-        known = eqx.tree_at(lambda s: (s.stage, s.first), self, (stage, first))
+        alone, here = self.history.alone(self.start)
+        changed = ~alike(self.history.rows, self.history.rows[here])[:, None]
+        new = stage, first, jnp.any(alone & changed, axis=0)
+        known = eqx.tree_at(lambda s: (s.stage, s.first, s.matters), self, new)
         _, row, _ = self.history.best(self.start)
         moved = ~alike(self.history.rows, row) & self.history.valid
         few = 2 * (1 + jnp.sum(moved)) <= jnp.sum(self.history.valid)
