@@ -209,19 +209,22 @@ def _positional(host: HostFunction, args: tuple, named: dict[str, Any]) -> tuple
     """The arguments by their places, some of which were given by name."""
     needs = f"the black box {host.name!r} takes arguments by their places"
     try:
-        bound = inspect.signature(host.fun).bind(*args, **named)
+        signature = inspect.signature(host.fun)
+        given = signature.bind(*args, **named).arguments
     except ValueError as error:  # as of functions in C
         raise TypeError(f"{needs}, not by names such as {next(iter(named))!r}") from error
     except TypeError as error:
         raise TypeError(f"the black box {host.name!r}: {error}") from error
-    if bound.kwargs:  # what lies between has its default
-        bound.apply_defaults()
-    if bound.kwargs:
+    kinds = inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD
+    places = {each.name: each for each in signature.parameters.values() if each.kind in kinds}
+    if others := [name for name in named if name not in places]:
         raise TypeError(
-            f"{needs}, and {', '.join(bound.kwargs)} can only be given by name: leave out the `*` "
+            f"{needs}, and {', '.join(others)} can only be given by name: leave out the `*` "
             "or `**` in its definition, or make the box of a lambda"
         )
-    return bound.args
+    # what lies between has its default
+    count = 1 + max(i for i, name in enumerate(places) if name in given)
+    return tuple(given.get(name, each.default) for name, each in list(places.items())[:count])
 
 
 def _array(name: str, leaf: Any) -> jax.Array:

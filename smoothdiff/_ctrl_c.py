@@ -1,13 +1,66 @@
 """Ctrl-C during a run ends it, wherever it comes."""
 
 import contextlib
+import os
 import signal
 import socket
 import threading
 from collections.abc import Iterator
 
-# a socket of each `ctrl_c_noticed` block that is open, the innermost last
-_open: list[socket.socket] = []
+
+class _Watch:
+    """Whether Ctrl-C came while runs were under way, the innermost last.
+
+    The operating system writes the number of each signal to a socket at once. It stays open, as a
+    signal that comes while a block ends must not be written elsewhere.
+    """
+
+    def __init__(self):
+        self.pressed: list[bool] = []
+        self._ends: tuple[socket.socket, socket.socket] | None = None
+        # who is told of signals otherwise, such as a loop of asyncio's
+        self._other = -1
+        # a thread of JAX's reads as well
+        self._lock = threading.Lock()
+
+    def begin(self) -> int:
+        """Who was told of signals before."""
+        if self._ends is None:
+            self._ends = socket.socketpair()
+            for end in self._ends:
+                end.setblocking(False)
+        ours = self._ends[1].fileno()
+        before = signal.set_wakeup_fd(ours, warn_on_full_buffer=False)
+        if before != ours:
+            self._other = before
+        return before
+
+    def end(self, before: int) -> None:
+        """Tells of signals who was told before."""
+        signal.set_wakeup_fd(before)
+        self.read()
+
+    def read(self) -> bool:
+        """Whether Ctrl-C came during the innermost run."""
+        with self._lock, contextlib.suppress(BlockingIOError):  # nothing came
+            while self._ends is not None and (came := self._ends[0].recv(4096)):
+                if self.pressed:
+                    self.pressed[-1] |= signal.SIGINT in came
+                if self._other >= 0:
+                    with contextlib.suppress(OSError):  # closed, or full
+                        os.write(self._other, came)
+        return bool(self.pressed) and self.pressed[-1]
+
+    def forget(self) -> None:
+        """A process that was forked has signals of its own."""
+        if self.pressed:
+            signal.set_wakeup_fd(-1)
+        self.__init__()
+
+
+_watch = _Watch()
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_watch.forget)
 
 
 @contextlib.contextmanager
@@ -16,38 +69,30 @@ def ctrl_c_noticed() -> Iterator[None]:
 
     Python does so in the main thread, when that runs Python next; not in a thread of JAX's, which
     evaluates the rest of a batch. In a hook of JAX's the exception is dropped, or becomes another
-    one. So the signal itself is looked for, of which the operating system tells a socket at once;
-    but not in other threads, nor where Ctrl-C means something else.
+    one. So the signal itself is looked for; but not in other threads, nor where Ctrl-C means
+    something else.
     """
     alone = threading.current_thread() is threading.main_thread()
     if not alone or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         yield
         return
-    told, end = socket.socketpair()
-    with told, end:
-        told.setblocking(False)
-        end.setblocking(False)
-        before = signal.set_wakeup_fd(end.fileno(), warn_on_full_buffer=False)
-        _open.append(told)
-        try:
-            yield
-        finally:
-            _open.remove(told)
-            signal.set_wakeup_fd(before)
+    before, outer = None, len(_watch.pressed)
+    try:
+        _watch.pressed.append(False)
+        before = _watch.begin()
+        yield
+    finally:
+        if before is not None:
+            _watch.end(before)
+        del _watch.pressed[outer:]
 
 
 def raise_if_pressed() -> None:
     """Raises KeyboardInterrupt where Ctrl-C came, in whatever thread this is."""
-    if _pressed():
+    if _watch.read():
         raise KeyboardInterrupt
 
 
 def is_ctrl_c(error: BaseException) -> bool:
     """Whether an exception is that of Ctrl-C, or follows from it."""
-    return isinstance(error, KeyboardInterrupt) or _pressed()
-
-
-def _pressed() -> bool:
-    with contextlib.suppress(IndexError, BlockingIOError):  # no block is open, nothing came
-        return signal.SIGINT in _open[-1].recv(65536, socket.MSG_PEEK)
-    return False
+    return isinstance(error, KeyboardInterrupt) or _watch.read()

@@ -131,7 +131,8 @@ class HostProblem(Problem):
         """Knows what the search has evaluated."""
         if self.known is not None:
             history = state.search.history
-            self.known.learn(history.points[history.valid], history.rows[history.valid])
+            evaluated = history.evaluated()
+            self.known.learn(history.points[evaluated], history.rows[evaluated])
 
     def spare(self, y: PyTree, state: PointState) -> int:
         """Of the evaluations for the judgement, those that a function without noise leaves."""

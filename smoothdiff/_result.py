@@ -188,6 +188,7 @@ def kept_residuals(result: Result) -> History | None:
     if not (isinstance(state, PointState) and result.solver.squares):
         return None
     history = state.around_lowest()
+    history = dataclasses.replace(history, valid=history.evaluated())
     if state.search.average is not None:
         # those with several keys differ by more than slopes do
         history = dataclasses.replace(history, valid=history.valid & False)

@@ -158,9 +158,7 @@ def test_wrong_arguments_say_what_to_write(changed, message):
         check(**usual, key=jax.random.key(0))
 
 
-@pytest.mark.parametrize(
-    "fun", [lambda y: jnp.sum(y**2), lambda y: 1 + jnp.sum(jnp.cos(y)), lambda y: 3.0 + 0 * y[0]]
-)
+@pytest.mark.parametrize("fun", [lambda y: jnp.sum(y**2), lambda y: 1 + jnp.sum(jnp.cos(y))])
 def test_a_gradient_that_vanishes_can_pass(fun, key):
     right = jax.jit(jax.grad(fun))
     check = lambda grad: sd.check_gradient(grad, jax.jit(fun), jnp.zeros(2), 0.1, key=key)

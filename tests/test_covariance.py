@@ -231,7 +231,7 @@ def test_the_search_that_found_the_answer_tells_its_errors():
 def test_of_equal_searches_the_last_has_the_answer():
     def history(place, lowest):
         rows, funs = jnp.ones((3, 2)), jnp.array([2.0, lowest, -1])
-        return History(jnp.full((3, 1), place), rows, funs, jnp.array([True, True, False]))
+        return History.of(jnp.full((3, 1), place), rows, funs, jnp.array([True, True, False]))
 
     def place(found, here) -> Any:
         state: Any = SimpleNamespace(found=found, search=SimpleNamespace(history=here))

@@ -1,7 +1,9 @@
 """Ctrl-C ends a run wherever it comes, without a further evaluation."""
 
 import concurrent.futures
+import contextlib
 import signal
+import socket
 import threading
 import time
 
@@ -81,6 +83,33 @@ def test_the_next_run_knows_nothing_of_it():
     stop = lambda record: signal.raise_signal(signal.SIGINT)
     assert run(sd.black_box(stairs, 0.0), callback=stop).reason == "interrupted"
     assert run(sd.black_box(stairs, 0.0), max_steps=3).reason == "max_steps"
+
+
+def test_others_are_told_of_signals_all_the_same():
+    """As a loop of asyncio's is; and more signals than a buffer holds leave room for Ctrl-C."""
+    told, end = socket.socketpair()
+    with told, end:
+        end.setblocking(False)
+        before = signal.set_wakeup_fd(end.fileno())
+        usual = signal.signal(signal.SIGUSR1, lambda *_: None)
+
+        def host(y):
+            for _ in range(400):
+                signal.raise_signal(signal.SIGUSR1)
+            return stairs(y)
+
+        def callback(record):
+            if record.step == 20:
+                with contextlib.suppress(KeyboardInterrupt):
+                    signal.raise_signal(signal.SIGINT)
+
+        try:
+            assert run(sd.black_box(host, 0.0), callback=callback).reason == "interrupted"
+            assert signal.set_wakeup_fd(before) == end.fileno()
+            assert signal.SIGUSR1 in told.recv(100)
+        finally:
+            signal.set_wakeup_fd(before)
+            signal.signal(signal.SIGUSR1, usual)
 
 
 def test_other_threads_and_other_handlers_are_left_alone():

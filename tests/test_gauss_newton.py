@@ -663,7 +663,7 @@ def test_wide_samples_stay_wide_along_a_parameter_that_tells_little(seed):
         jnp.where(pixels[None] < points[:, :1], 1.0, 0.0) - jnp.where(pixels < 0.3, 1.0, 0.0)[None]
     )
     rows = rows.at[:, 0].set(0.1 * points[:, 1])
-    history = History(points, rows, jnp.sum(rows**2, axis=1) / 2, jnp.ones(16, bool))
+    history = History.of(points, rows, jnp.sum(rows**2, axis=1) / 2, jnp.ones(16, bool))
     params = take_apart(jnp.zeros(n), 1.0, None)
     wide = Wide.start(jnp.zeros(n), jnp.ones(64), jnp.ones(n))
     for _ in range(3):  # once it may grow by a half, and fall to a quarter

@@ -577,3 +577,4 @@ def test_a_crop_window_is_kept():
     blocks = finer.reshape(16, 2, 8, 2, 3).mean(axis=(1, 3))
     assert np.mean(np.abs(blocks - seen)) < 0.2 * np.mean(np.abs(seen - np.mean(seen)))
     np.testing.assert_allclose(own(away), seen, rtol=1e-5)
+    assert render(resolution=11)(away).shape == (11, 11, 3)

@@ -25,7 +25,7 @@ def fit_of(jacobian: Any, spread: Any) -> Fit:
 
 def history_of(points, rows):
     funs = jnp.sum(rows**2, axis=1) / 2
-    return History(points, rows, funs, jnp.ones(len(points), bool))
+    return History.of(points, rows, funs, jnp.ones(len(points), bool))
 
 
 # where the check is

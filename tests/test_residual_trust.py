@@ -255,7 +255,7 @@ def test_the_best_point_stays_in_the_history(x64):
 
     @jax.jit
     def followed(history, point, rows):
-        new = History(point, rows, jnp.sum(rows**2, axis=1) / 2, jnp.ones(1, bool))
+        new = History.of(point, rows, jnp.sum(rows**2, axis=1) / 2, jnp.ones(1, bool))
         return history.followed_by(new, True)
 
     for i in range(40):

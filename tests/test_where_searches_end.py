@@ -116,7 +116,7 @@ def searched(dtype):
 @jax.jit
 def lowered(search, value, count):
     points, rows, funs = (jnp.full(s, value, search.fall.to.dtype) for s in ((1, 3), (1, 1), (1,)))
-    return search.kept(History(points, rows, funs, jnp.ones(1, bool))).marked(count)
+    return search.kept(History.of(points, rows, funs, jnp.ones(1, bool))).marked(count)
 
 
 @pytest.mark.parametrize(("dtype", "little"), [(jnp.float32, 3e-6), (jnp.float64, 3e-9)])

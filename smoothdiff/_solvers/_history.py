@@ -38,18 +38,30 @@ class History(eqx.Module):
     """Evaluations from the oldest to the newest; at first all of them are empty, and not `valid`.
 
     A row holds what the function returned, residuals or one value, and `funs` what is minimised.
+    Where it had no value one may be `guessed`, see `barred`, which is valid to the models.
     """
 
     points: Float[Array, "M n"]
     rows: Float[Array, "M P"]
     funs: Float[Array, " M"]
     valid: Bool[Array, " M"]
+    guessed: Bool[Array, " M"]
+
+    @staticmethod
+    def of(
+        points: Float[Array, "M n"],
+        rows: Float[Array, "M P"],
+        funs: Float[Array, " M"],
+        valid: Bool[Array, " M"],
+    ) -> "History":
+        """Of evaluations, none of them guessed."""
+        return History(points, rows, funs, valid, jnp.zeros(valid.shape, bool))
 
     @staticmethod
     def empty(length: int, n: int, size: int, dtype) -> "History":
         """Of so many evaluations at n parameters, with so many residuals each."""
         points, rows = jnp.zeros((length, n), dtype), jnp.zeros((length, size), dtype)
-        return History(points, rows, jnp.zeros(length, dtype), jnp.zeros(length, bool))
+        return History.of(points, rows, jnp.zeros(length, dtype), jnp.zeros(length, bool))
 
     def after(
         self,
@@ -64,7 +76,7 @@ class History(eqx.Module):
         def latest(old: Array, new: Array) -> Array:
             return jax.lax.dynamic_slice_in_dim(jnp.concatenate([old, new]), count, len(old))
 
-        return jax.tree.map(latest, self, History(points, rows, funs, valid))
+        return jax.tree.map(latest, self, History.of(points, rows, funs, valid))
 
     def alone(self, start: Float[Array, " n"]) -> tuple[Bool[Array, "M n"], Int[Array, ""]]:
         """Which evaluations are off the start in this parameter alone; the place of the start's."""
@@ -112,10 +124,19 @@ class History(eqx.Module):
         If only the radius shrank, steps would end near the edge, wherever they meet it.
         """
         high = fun + _BARRED * jnp.maximum(promise, 0)
-        bars = ~self.valid & (high > fun)
-        larger = jnp.sqrt(high / jnp.where(bars, fun, 1))[:, None] * row[None] if squares else high
-        rows = jnp.where(bars[:, None], larger, self.rows)
-        return History(self.points, rows, jnp.where(bars, high, self.funs), self.valid | bars)
+        bars = ~self.valid & (high > fun) & jnp.isfinite(high)
+        if squares:
+            bars &= fun > 0
+            rows = jnp.sqrt(high / jnp.where(bars, fun, 1))[:, None] * row[None]
+        else:
+            rows = high
+        rows = jnp.where(bars[:, None], rows, self.rows)
+        funs = jnp.where(bars, high, self.funs)
+        return History(self.points, rows, funs, self.valid | bars, bars)
+
+    def evaluated(self) -> Bool[Array, " M"]:
+        """Which of them are what the function returned."""
+        return self.valid & ~self.guessed
 
     def went_lower(self, other: "History") -> Bool[Array, ""]:
         """Whether the lowest value is lower than that of another history."""

@@ -220,7 +220,8 @@ class PointStep(eqx.Module):
         """These evaluations, of which those count that are finite."""
         funs = objectives(rows, self.solver.squares)
         good = jnp.isfinite(funs)
-        return History(points, jnp.where(good[:, None], rows, 0), jnp.where(good, funs, 0), good)
+        rows, funs = jnp.where(good[:, None], rows, 0), jnp.where(good, funs, 0)
+        return History.of(points, rows, funs, good)
 
     def step(self, evaluate: Evaluator) -> tuple[PyTree[Array], PointState, PyTree]:
         """The next evaluation, or as many as run at once."""

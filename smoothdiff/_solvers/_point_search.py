@@ -197,20 +197,20 @@ class AbstractPointSearch(eqx.Module):
 
         Where there are numbers elsewhere, more may fail, as they come nearer.
         """
-        valid = self.history.valid
+        valid = self.history.evaluated()
         first = (self.stage == FIRST) & jnp.any(valid)
         # the best one stays among the oldest
         newest = min(_COMING * count, len(valid) - 1)
         return (self.evaluated < count) | jnp.any(valid[-newest:]) | first
 
     def at_edge(self) -> Bool[Array, ""]:
-        """Whether more evaluations of those in the history than parameters have no value.
+        """Whether more of the last evaluations than there are parameters had no value.
 
         Once or twice a step may just have gone too far, and a shorter one is all it takes.
         """
-        valid = self.history.valid
-        known = jnp.minimum(self.evaluated, len(valid))
-        return known - jnp.sum(valid, dtype=known.dtype) > len(self.start)
+        finite = self.history.evaluated()
+        known = jnp.minimum(self.evaluated, len(finite))
+        return known - jnp.sum(finite, dtype=known.dtype) > len(self.start)
 
     def converged(self) -> Bool[Array, ""]:
         """Whether the last steps were small."""

@@ -34,10 +34,10 @@ class ResidualSearch(ResidualState):
     """What is evaluated next, and what that teaches: a local model and a wide one."""
 
     def counted(self, small: Array, teaches: Array, last: Array, count: int) -> "ResidualSearch":
-        """Before wide rounds have looked around once, two answers are in doubt.
+        """Two answers are in doubt until wide rounds have looked around once.
 
-        That in a ripple, and one where a parameter that mattered does not any more, as of whole
-        numbers: it may take a step of several together.
+        One is that in a ripple. The other is one where a parameter that mattered changes nothing,
+        as a whole number does: several parameters may have to step together.
         """
         after = super().counted(small, teaches, last, count)
         unseen = (self.wide.rounds == 0) & self.is_local()

@@ -105,6 +105,7 @@ class ResidualState(AbstractLookingSearch):
         return jnp.any(self.matters & (slopes <= jnp.finfo(slopes.dtype).eps * jnp.max(slopes)))
 
     def much(self) -> Bool[Array, ""]:
+        """Whether much of the loss at the start is left."""
         return self.history.best(self.start)[2] > _MUCH * self.first.before
 
     def round(self) -> Int[Array, ""]:

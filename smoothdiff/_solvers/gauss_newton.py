@@ -105,7 +105,7 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         batch_size: evaluate at most so many samples at a time, as for `smooth`.
         nonfinite: "propagate" or "drop" samples with a NaN or an infinity in their residuals; a
             round that loses half of them is followed by a narrower one. The end of a step that is
-            tried may be anything; after n failures one that fails counts as a little worse than
+            tried may be anything; after more than n failures one counts as a little worse than
             the best point, so the model turns away from there.
         rtol: relative tolerance. The run has converged when three steps in a row are shorter than
             the tolerance, for each parameter atol + rtol max(|y|, sigma), unless only the radius

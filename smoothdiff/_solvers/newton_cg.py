@@ -59,7 +59,7 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
       lead nowhere the center goes back to the best point.
 
     With `nonfinite="drop"`, where both first points of a parameter fail, nearer ones follow, and so
-    they do after a round of samples that all fail. After n failures a step that fails counts as a
+    they do after a round of samples that all fail. After more than n failures one counts as a
     little higher than the best point, so the model turns away from there. A parameter whose first
     points had the value of the start, and whose sigma is below a thousandth of the largest, has
     farther ones. Else it keeps no run going. In the end it is back at the start, if that raises

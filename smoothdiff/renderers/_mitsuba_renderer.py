@@ -67,8 +67,8 @@ def renderer(
         axis: Direction in world space that `"NAME.rotate"` turns about, anti-clockwise for a viewer
             that it points at; or a dict from object to direction, `{"mug": (0, 0, 1)}`. Others
             turn about any.
-        resolution: Pixels, `(height, width)` or the side of a square. None: as the scene says. A
-            film with a crop window has that window, scaled, to whole pixels.
+        resolution: Pixels, `(height, width)` or the side of a square. None: as the scene says. Of
+            a film with a crop window it is that of the window, which is rounded to whole pixels.
         spp: Samples per pixel. None: as the scene says.
         integrator: The type of a Mitsuba integrator, such as `"direct"`, a dict as for
             `mitsuba.load_dict`, or a loaded integrator. None: as the scene says.
@@ -288,8 +288,11 @@ def _films(
     wanted = np.array([width, height])
     values = {}
     for film in films:
-        scale = wanted / loaded.initial(f"{film}.crop_size")
+        size, window, offset = (loaded.initial(f"{film}.{part}") for part in _WINDOW)
+        scale = wanted / window
+        offset = np.round(scale * offset).astype(int)
+        size = np.maximum(np.round(scale * size).astype(int), offset + wanted)
         # told of the size alone, Mitsuba would take the whole film
-        for name in (f"{film}.{part}" for part in _WINDOW):
-            values[name] = np.round(scale * loaded.initial(name)).astype(int)
+        parts = zip(_WINDOW, (size, wanted, offset), strict=True)
+        values |= {f"{film}.{part}": value for part, value in parts}
     return values, (height, width, 3)
