@@ -1,7 +1,6 @@
 """Where a search of Gauss-Newton stands: how it begins, and how it ends."""
 
 import dataclasses
-from typing import Self
 
 import equinox as eqx
 import jax
@@ -35,7 +34,7 @@ class ResidualState(AbstractLookingSearch):
     matters: Bool[Array, " n"]
 
     @classmethod
-    def of(cls, theta: Float[Array, " n"], history: History) -> Self:
+    def of(cls, theta: Float[Array, " n"], history: History) -> "ResidualState":
         """Nothing is known but what is in the history."""
         n, size = len(theta), history.rows.shape[1]
         one, none = jnp.ones((), theta.dtype), jnp.zeros((), jnp.int32)
@@ -63,20 +62,22 @@ class ResidualState(AbstractLookingSearch):
         start: Float[Array, " n"],
         lowest: tuple[Float[Array, " n"], Float[Array, ""]],
         key: Array,
-    ) -> Self:
+    ) -> "ResidualState":
         """Another search, from elsewhere, with other random numbers."""
         empty = jax.tree.map(jnp.zeros_like, self.history)
         anew = self.of(theta, empty)
         anew = dataclasses.replace(anew, look=self.look)
         return eqx.tree_at(lambda s: s.wide.rounds, anew, self.wide.rounds + 1)
 
-    def elsewhere(self, params: Params, theta: Float[Array, " n"]) -> Self:
+    def elsewhere(self, params: Params, theta: Float[Array, " n"]) -> "ResidualState":
         """Another search, with all that was evaluated."""
         anew = self.of(theta, self.history)
         anew = dataclasses.replace(anew, pilot=self.pilot, look=self.look)
         return anew.widened(params, theta, jnp.ones_like(theta[0]))
 
-    def widened(self, params: Params, theta: Float[Array, " n"], width: Float[Array, ""]) -> Self:
+    def widened(
+        self, params: Params, theta: Float[Array, " n"], width: Float[Array, ""]
+    ) -> "ResidualState":
         """With longer steps along the parameters, from a point that is known."""
         first = self.first.around(self.history.best(theta)[2])
         first = dataclasses.replace(first, reach=width * first.reach)
