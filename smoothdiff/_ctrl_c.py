@@ -24,7 +24,7 @@ class _Watch:
         self._lock = threading.Lock()
 
     def begin(self) -> int:
-        """Who was told of signals before."""
+        """Is told of signals from now on; who was before."""
         if self._ends is None:
             self._ends = socket.socketpair()
             for end in self._ends:
@@ -36,7 +36,7 @@ class _Watch:
         return before
 
     def end(self, before: int) -> None:
-        """Tells of signals who was told before."""
+        """Others are told of signals again, as before."""
         signal.set_wakeup_fd(before)
         self.read()
 

@@ -89,7 +89,7 @@ class ResidualState(AbstractLookingSearch):
         return self.is_looking()
 
     def level(self) -> Bool[Array, ""]:
-        """One of the local model."""
+        """Whether the local model's last step promised no more than rounding, and came to that."""
         return self.is_local() & self.trust.level
 
     def lost(self, sizes: Sizes) -> Bool[Array, ""]:
