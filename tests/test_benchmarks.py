@@ -14,10 +14,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 from stripes import REFERENCE, build, halving, registered
 
 from benchmarks import __main__ as cli
-from benchmarks import _loop, _registry, _study
+from benchmarks import _loop, _registry, _study, _style
 from benchmarks._cache import cached
 from benchmarks._summary import cost_to_level, quartiles
 from benchmarks._task import Budget, Method, NotAble, Problem, Score, Task
@@ -431,3 +432,12 @@ def killing(problem):
         solve(y0, key, record)
 
     return killed
+
+
+def test_figures_have_few_colours(tmp_path):
+    path = tmp_path / "figure.png"
+    with _style.figure(path, 1, 1, (3.0, 2.0)) as (_, axes):
+        axes[0, 0].imshow(np.linspace(0, 1, 400).reshape(20, 20))
+    with Image.open(path) as picture:
+        assert picture.mode == "P"
+        assert picture.size == (450, 300)
