@@ -3,9 +3,11 @@ r"""Standard errors: how far the independent groups of samples spread around the
 Every estimate is a ratio of sums over groups, $\hat e = \sum_g s_g / \sum_g n_g$, with $n_g$
 samples in group g; its standard error is
 $\sqrt{\tfrac{G}{G-1} \sum_g (s_g - n_g \hat e)^2} / \sum_g n_g$.
+What the smoothed baseline adds to an estimate is in no row, so it is not in $\hat e$ either.
+
 A single scrambled point set has one group; its points then count as independent, which is too wide:
 the 95 % interval of a gradient reaches 4.8 times the RMSE to either side with the baseline "mean",
-3.5 times with "gp", where about 2 would do (`python -m benchmarks variance --full`, ten dimensions,
+2.9 times with "gp", where about 2 would do (`python -m benchmarks variance --full`, ten dimensions,
 N = 256). R scrambled sets are R groups, and Student's t has R - 1 degrees of freedom.
 
 All is computed in units of sigma and of the largest residual, so that squares neither overflow nor
@@ -19,6 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from smoothdiff._baselines import Constant
 from smoothdiff._batch import Batch
 from smoothdiff._estimate import weigh, weights
 
@@ -27,26 +30,33 @@ from smoothdiff._estimate import weigh, weights
 def value_stderr(batch: Batch, estimate: PyTree) -> PyTree:
     """The standard error of the smoothed value, leaf by leaf; of the sum of terms for a scalar."""
 
-    def leaf(values: Array, residual: Array, mean: Array) -> Array:
+    constant = isinstance(batch.control, Constant)
+
+    def leaf(values: Array, residual: Array, known: Array, mean: Array) -> Array:
         def sums(z, log_ratio, rows, shift):
-            # at zero displacement: w (f - b) + b, which is f itself for plain Gaussian points
             value, rest = rows
-            out = weigh(weights(batch, z, log_ratio, shift), rest) + (value - rest)
+            out = weigh(weights(batch, z, log_ratio, shift), rest)
+            if constant:
+                # each row's own number comes back: for plain Gaussian points that is f itself
+                out += value - rest
             flat = out.reshape(len(out), -1)
             return flat if mean.ndim else jnp.sum(flat, axis=1, keepdims=True)
 
+        back = jnp.zeros_like(known) if constant else known
+        center = (mean - (back if mean.ndim else jnp.sum(back))).reshape(-1)
         scale = jnp.max(jnp.abs(residual))
-        return _spread(batch, sums, (values, residual), mean.reshape(-1), scale).reshape(mean.shape)
+        return _spread(batch, sums, (values, residual), center, scale).reshape(mean.shape)
 
-    return jax.tree.map(leaf, batch.values, batch.control.errors(), estimate)
+    known = _known(batch)(_no_shift(batch))
+    return jax.tree.map(leaf, batch.values, batch.control.errors(), known, estimate)
 
 
 @eqx.filter_jit
 def jacobian_stderr(batch: Batch, estimate: PyTree) -> PyTree:
     """The standard error of the derivative in units of sigma; leaves (..., n) like `estimate`."""
 
-    def leaf(residual: Array, mean: Array) -> Array:
-        columns = mean.reshape(-1, mean.shape[-1]).T
+    def leaf(residual: Array, known: Array, mean: Array) -> Array:
+        columns = (mean - known).reshape(-1, mean.shape[-1]).T
         scale = jnp.max(jnp.abs(residual))
 
         def column(direction: Array, column_mean: Array) -> Array:
@@ -61,7 +71,8 @@ def jacobian_stderr(batch: Batch, estimate: PyTree) -> PyTree:
         out = jax.lax.map(lambda a: column(*a), (jnp.eye(n, dtype=batch.draws.dtype), columns))
         return out.T.reshape(mean.shape)
 
-    return jax.tree.map(leaf, batch.control.errors(), estimate)
+    known = jax.jacfwd(_known(batch))(_no_shift(batch))
+    return jax.tree.map(leaf, batch.control.errors(), known, estimate)
 
 
 @eqx.filter_jit
@@ -69,7 +80,8 @@ def grad_stderr(batch: Batch, estimate: Float[Array, " n"]) -> Float[Array, " n"
     """The standard error of the gradient in units of sigma, for a scalar function."""
     residual = batch.control.errors()
     sums = lambda z, log_ratio, rows, shift: _row_grad(batch, z, log_ratio, rows)(shift)
-    return _spread(batch, sums, residual, estimate, jnp.max(jnp.abs(residual)))
+    known = jax.grad(_known_sum(batch))(_no_shift(batch))
+    return _spread(batch, sums, residual, estimate - known, jnp.max(jnp.abs(residual)))
 
 
 @eqx.filter_jit
@@ -83,7 +95,8 @@ def hvp_stderr(
         tangent = jnp.broadcast_to(direction, shift.shape)
         return jax.jvp(_row_grad(batch, z, log_ratio, rows), (shift,), (tangent,))[1]
 
-    return _spread(batch, sums, residual, estimate, jnp.max(jnp.abs(residual)))
+    known = jax.jvp(jax.grad(_known_sum(batch)), (_no_shift(batch),), (direction,))[1]
+    return _spread(batch, sums, residual, estimate - known, jnp.max(jnp.abs(residual)))
 
 
 @eqx.filter_jit
@@ -95,6 +108,19 @@ def free_grad_stderr(batch: Batch, per_row: Array) -> tuple[Array, Array]:
     sums = lambda z, log_ratio, rows, shift: rows
     error = _spread(batch, sums, rows, mean, jnp.max(jnp.abs(rows)))
     return mean.reshape(per_row.shape[1:]), error.reshape(per_row.shape[1:])
+
+
+def _no_shift(batch: Batch) -> Float[Array, " n"]:
+    return jnp.zeros(batch.draws.n, batch.draws.dtype)
+
+
+def _known(batch: Batch) -> Callable[[Array], PyTree]:
+    """The smoothed baseline at displaced parameters, which is no part of any sample's row."""
+    return lambda shift: batch.control.smoothed(shift, None)
+
+
+def _known_sum(batch: Batch) -> Callable[[Array], Array]:
+    return lambda shift: jnp.sum(_known(batch)(shift))
 
 
 def _row_grad(
