@@ -11,7 +11,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from closed_forms import Several, assert_unbiased, half_space, keys, smoothed_half_space
+from closed_forms import (
+    Several,
+    assert_unbiased,
+    half_space,
+    keys,
+    quadratic_model,
+    smoothed_half_space,
+)
 from parts import new_ones
 
 import smoothdiff as sd
@@ -123,3 +130,27 @@ def test_the_mean_of_one_weighted_set_is_biased(num_samples):
     assert error < 0.003
     bias = np.mean(found) / exact - 1
     assert abs(bias - {8: -0.084, 24: -0.024}[num_samples]) < 4.5 * error
+
+
+@pytest.mark.parametrize(("sampler", "num_samples"), [(sd.Sobol(), 1), (sd.Sobol(True), 2)])
+def test_a_lone_point_loses_nothing_to_a_mean(sampler, num_samples, key):
+    """Less its own mean it would be zero, and with it the gradient, or the Hessian of a pair."""
+    options: dict[str, Any] = {"sampler": sampler, "num_samples": num_samples}
+    models = [
+        quadratic_model(cubic_and_step, SIGMA, baseline=b, **options) for b in ("mean", "none")
+    ]
+    for mean, none in zip(*jax.jit(lambda: [g(key, THETA) for g in models])(), strict=True):
+        np.testing.assert_array_equal(mean, none)
+        assert np.all(mean != 0)
+
+
+@pytest.mark.parametrize(
+    ("num_samples", "bias"),
+    [(2, -0.18), *(pytest.param(*case, marks=pytest.mark.slow) for case in [(3, -0.14), (8, 0)])],
+)
+def test_the_mean_of_a_small_set_is_biased_as_it_says(num_samples, bias):
+    g = sd.smooth_grad(jnp.sum, 1.0, baseline="mean", num_samples=num_samples)
+    found = np.asarray(jax.jit(jax.vmap(g, (0, None)))(keys(20_000), jnp.zeros(())), float)
+    error = np.std(found) / np.sqrt(20_000)
+    assert error < 0.01
+    assert abs(np.mean(found) - 1 - bias) < 4.5 * error + 0.005
