@@ -37,7 +37,7 @@ def large_steps(
             positions: a number or an optax schedule.
         faces: (faces, 3), which vertices each triangle has. With `optax.inject_hyperparams`, name
             faces and lam in its static_args.
-        lam: λ, how far steps are smoothed: over about √λ edges. The paper has 19.
+        lam: λ, how far steps are smoothed: over about √λ edges. The paper has 19; at most 1e10.
         b1: β1, how much of the first moment a step keeps.
         b2: β2, how much of the second moment a step keeps. With b1 = b2 = 0 there is no state.
         eps: ε, keeps the division from zero.

@@ -95,7 +95,7 @@ def test_laplacian_is_the_inverse_of_the_dense_matrix(body, weights, lam, dtype)
 
 def test_power_is_applying_it_again(body, x64):
     positions, faces = body
-    once, twice = mesh_laplacian(faces, LAM), mesh_laplacian(faces, LAM, power=2)
+    once, twice = mesh_laplacian(faces, LAM), mesh_laplacian(faces, LAM, power=2.0)
 
     @jax.jit
     def both(signal):
@@ -326,6 +326,7 @@ def test_traced_faces_are_refused():
         ({"lam": -1.0}, "lam"),
         ({"lam": np.inf}, "lam"),
         ({"lam": np.nan}, "lam"),
+        ({"lam": 1e16}, "mean of each connected part"),
         ({"lam": 1.0, "power": 0}, "power"),
         ({"lam": 1.0, "weights": "mean"}, "cotangent"),
     ],
@@ -333,6 +334,19 @@ def test_traced_faces_are_refused():
 def test_bad_options_of_the_laplacian_are_refused(options, says):
     with pytest.raises(ValueError, match=says):
         mesh_laplacian([[0, 1, 2]], **options)
+
+
+def test_the_largest_lambda_is_the_mean_of_each_connected_part(dtype):
+    positions, faces = MESHES["apart"]
+    signal = noise(positions).astype(dtype)
+    one = len(icosphere(1)[0])
+    means = [np.broadcast_to(part.mean(0), part.shape) for part in (signal[:one], signal[one:-1])]
+    expected = np.concatenate([*means, signal[-1:]])
+    found = mesh_laplacian(faces, mesh.MOST_LAM)(jnp.asarray(signal), None)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    cotangent = mesh_laplacian(faces, mesh.MOST_LAM, weights="cotangent")
+    found = cotangent(jnp.asarray(signal), positions)
+    np.testing.assert_allclose(found, expected, atol=2e-3)
 
 
 @pytest.mark.parametrize("bad", [{"sigma_d": 0.0}, {"sigma_phi": -1.0}, {"num_directions": 0}])
