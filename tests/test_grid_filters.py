@@ -6,9 +6,11 @@ import itertools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from jax.test_util import check_grads
 
+import smoothdiff as sd
 from smoothdiff.filters import bilateral, cross_bilateral, laplacian
 
 SHAPES = [(9,), (5, 6), (3, 4, 5), (1, 5), (1, 1, 1)]
@@ -187,6 +189,26 @@ def test_whole_numbers_are_filtered_as_floats(integers):
         np.testing.assert_array_equal(found, filter(floats, floats))
 
 
+@pytest.mark.parametrize("coarse", [jnp.float16, jnp.bfloat16])
+def test_coarse_numbers_are_filtered_in_float32(coarse):
+    """Their own range is too small for sigma_d = 0 and inf, and sums of theirs lose digits."""
+    signal, guide = (jnp.asarray(random(6, 5, seed=i), coarse) for i in range(2))
+    fine = signal.astype(jnp.float32), guide.astype(jnp.float32)
+    filters = [cross_bilateral(d, 2, ndim=2) for d in (0.0, 0.5, jnp.inf)]
+    for filter in (*filters, laplacian(2.0, ndim=2)):
+        found = filter(signal, guide)
+        assert found.dtype == coarse
+        np.testing.assert_array_equal(found, filter(*fine).astype(coarse))
+
+
+def test_coarse_updates_keep_their_type_in_a_loop():
+    transform = sd.filter_updates(laplacian(2.0, ndim=1))
+    params = jnp.zeros(8, jnp.bfloat16)
+    step = lambda u, _: (transform.update(u, optax.EmptyState(), params)[0], None)
+    found, _ = jax.lax.scan(step, jnp.arange(8, dtype=jnp.bfloat16), length=3)
+    assert jnp.asarray(found).dtype == jnp.bfloat16
+
+
 def test_levels_set_the_reach():
     spike, flat = np.float32(np.arange(41) == 20), np.zeros(41, np.float32)
     for levels in (1, 2, 4):
@@ -283,6 +305,8 @@ def test_bad_arguments_are_refused():
     for make in (cross_bilateral, bilateral):
         with pytest.raises(ValueError, match="at least 1"):
             make(0.1, 0, ndim=2)
+        with pytest.raises(TypeError, match="levels must be a whole number"):
+            make(0.1, 3.0, ndim=2)  # pyright: ignore[reportArgumentType]
         with pytest.raises(ValueError, match="must not be negative"):
             make(-0.1, 1, ndim=2)
         with pytest.raises(ValueError, match="must be positive, in pixels"):

@@ -6,7 +6,6 @@ the signal, leaves constants as they are and has no eigenvalue larger than one i
 
 import itertools
 import math
-import operator
 from collections.abc import Callable
 from functools import partial
 
@@ -15,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Real
 
-from smoothdiff._numbers import floating
+from smoothdiff._numbers import at_least_float32, check_whole, floating
 from smoothdiff._params import is_concrete
 
 Filter = Callable[[Float[Array, "..."], Float[Array, "..."]], Float[Array, "..."]]
@@ -72,7 +71,7 @@ def cross_bilateral(
     eq. 3 and 4; Dammertz et al. 2010 for the passes.
     """
     _check_ndim(ndim)
-    levels = operator.index(levels)
+    check_whole(levels, "levels")
     if levels < 1:
         raise ValueError(f"levels={levels}: give at least 1, or leave the filter out")
     if is_concrete(sigma_d) and not sigma_d >= 0:
@@ -81,7 +80,7 @@ def cross_bilateral(
         raise ValueError(f"sigma_s={sigma_s} must be positive, in pixels; jnp.inf is a box")
 
     def filter(signal: Float[Array, "..."], guide: Float[Array, "..."]) -> Float[Array, "..."]:
-        signal, guide = floating(signal), floating(guide)
+        signal, guide = floating(signal), at_least_float32(floating(guide))
         for array in (signal, guide):
             _check_axes(array, ndim)
         if signal.shape[:ndim] != guide.shape[:ndim]:
@@ -99,10 +98,10 @@ def cross_bilateral(
         tiny, large = jnp.finfo(dtype).tiny, _largest(dtype) / (2 * _longest(dtype))
         inverse = 2 * math.log2(math.e) / jnp.clip(distance, tiny, large)
         room = jnp.where((distance >= 0) & (spatial > 0), jnp.asarray(_ROOM, dtype), jnp.nan)
-        planes, guides = _planes(signal, ndim), _planes(edges, ndim)
+        planes, guides = _planes(at_least_float32(signal), ndim), _planes(edges, ndim)
         for level in range(levels):
             planes = _smooth(planes, guides, inverse, spatial, room, 2**level)
-        return jnp.stack(planes, axis=-1).reshape(signal.shape)
+        return jnp.stack(planes, axis=-1).reshape(signal.shape).astype(signal.dtype)
 
     return filter
 
@@ -193,6 +192,7 @@ def laplacian(lam: Scale, *, ndim: int, power: int | float = 1) -> Filter:
         _check_axes(signal, ndim)
         if not signal.size:
             return signal
+        given, signal = signal.dtype, at_least_float32(signal)
         space, dtype = signal.shape[:ndim], signal.dtype
         # sums over all pixels could overflow, and so could the reciprocal of the largest number
         scaled = signal / 4
@@ -202,7 +202,8 @@ def laplacian(lam: Scale, *, ndim: int, power: int | float = 1) -> Filter:
         rates = jnp.asarray(rates, dtype).reshape(*space, *(1,) * (signal.ndim - ndim))
         gain = (1 + jnp.asarray(lam, dtype) * rates) ** -power
         gain = jnp.where(jnp.asarray(lam) >= 0, gain, jnp.nan)
-        return jax.scipy.fft.idctn(waves * gain, axes=range(ndim), norm="ortho") * size * 4
+        smooth = jax.scipy.fft.idctn(waves * gain, axes=range(ndim), norm="ortho") * size * 4
+        return smooth.astype(given)
 
     return filter
 
