@@ -87,7 +87,8 @@ def scale_by_filtered_adam(
         prefilter: filters the gradient.
         postfilter: filters the moments.
         second_moment: "filter" filters v like m, "max" takes the largest v of each leaf instead
-            (UniformAdam), "none" does not divide by it.
+            (UniformAdam), "none" does not divide by it. With `optax.inject_hyperparams`, name
+            prefilter, postfilter and second_moment in its static_args.
 
     Returns:
         A transformation, whose `update` needs the parameters if there is a filter.
@@ -173,7 +174,8 @@ def filtered_adam(
         eps: as for `scale_by_filtered_adam`.
         prefilter: as for `scale_by_filtered_adam`.
         postfilter: as for `scale_by_filtered_adam`.
-        second_moment: as for `scale_by_filtered_adam`.
+        second_moment: as for `scale_by_filtered_adam`; with `optax.inject_hyperparams` all three
+            are among its static_args.
 
     Returns:
         An optimiser, whose `update` needs the parameters if there is a filter.
