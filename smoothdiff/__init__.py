@@ -6,7 +6,7 @@ from smoothdiff._baselines import AbstractBaseline
 from smoothdiff._black_box import black_box
 from smoothdiff._call import Options
 from smoothdiff._check_gradient import GradientCheck, check_gradient
-from smoothdiff._coarse_to_fine import CoarseToFine, Level, coarse_to_fine
+from smoothdiff._coarse_to_fine import coarse_to_fine
 from smoothdiff._control_variate import control_variate
 from smoothdiff._filtered_adam import filter_updates, filtered_adam, scale_by_filtered_adam
 from smoothdiff._gp import GaussianProcess
@@ -17,6 +17,7 @@ from smoothdiff._importance import Importance, difference_hvp
 from smoothdiff._jaxlib import warn_if_it_can_hang
 from smoothdiff._large_steps import large_steps
 from smoothdiff._least_squares import LeastSquares
+from smoothdiff._levels import CoarseToFine, Level
 from smoothdiff._minimise import least_squares, minimise
 from smoothdiff._newton_step import newton_step
 from smoothdiff._noise import Noise

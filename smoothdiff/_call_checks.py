@@ -41,6 +41,17 @@ def check_start(y0: PyTree) -> None:
                 )
 
 
+def check_untraced(name: str, solver: str, inputs: PyTree) -> None:
+    """Raises TypeError where JAX traces the call, or one of its inputs."""
+    # under jit new arrays are traced, and inputs may be hidden in the function
+    if not all(map(is_concrete, [*jax.tree.leaves(inputs), jnp.zeros(())])):
+        raise TypeError(
+            f"sd.{name} runs outside of jit, vmap and grad: inside them call "
+            f'optimistix.{name}(fun, solver, y0, args, options={{"key": key}}) with a solver such '
+            f"as sd.{solver}(sigma)"
+        )
+
+
 def check_call(fun: Any, y0: Any, bounds: Any, space: Any, takes_key: bool = False) -> None:
     """Raises TypeError or ValueError for arguments in another order or of another library."""
     solvers = AbstractSmoothSolver | optx.AbstractIterativeSolver

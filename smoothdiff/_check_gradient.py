@@ -29,7 +29,8 @@ class GradientCheck:
     Attributes:
         wrong: where the gradient differs from that of the function by more than chance allows.
         undecided: where it may be right, but is known to no better than a tenth of the largest
-            entry, nor a hundredth of what it is at single points; more samples decide.
+            entry, nor a hundredth of what it is at single points; more samples decide. Of a
+            function that has one value at all points a gradient of zero is right.
         difference: the gradient less that of the function, both smoothed.
         low: the lower end of the interval of `difference`.
         high: the upper end.
@@ -151,7 +152,7 @@ def check_gradient(
     if params.free:
         raise ValueError("a leaf of y has no sigma: leave out of y what is not checked")
     z = jax.random.normal(as_key(key), (pairs, params.theta.size), params.theta.dtype)
-    values, gradients, rounding, usual = _evaluated(grad_fun, fun, params, z)
+    values, gradients, rounding, usual, constant = _evaluated(grad_fun, fun, params, z)
     u = np.asarray(z, float)
     slopes = _slopes(values, gradients, u)
     sampled = slopes + (values - np.sum(u * slopes, axis=1))[:, None] * u
@@ -167,6 +168,9 @@ def check_gradient(
     wrong = np.abs(mean) > half
     scale = max(np.max(np.abs(true)), np.max(np.abs(np.mean(gradients, axis=0))))
     undecided = ~wrong & (half > max(_ENOUGH * scale, _NEARLY * usual))
+    if constant and usual == 0:
+        # there is nothing that half could be a share of
+        undecided = np.zeros_like(undecided)
 
     leaves, treedef = jax.tree.flatten(y)
     ends = np.cumsum([leaf.size for leaf in leaves])
@@ -211,12 +215,12 @@ def _slopes(
 
 def _evaluated(
     grad_fun: Callable, fun: Callable, params: Params, z: Float[Array, "m n"]
-) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"], float, float]:
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, "m n"], float, float, bool]:
     """Half of the difference of each pair, the mean of both gradients, and what rounding may be.
 
-    And how large the gradient is at a point, in the root of its mean square, the largest entry.
-    In units of sigma. One call after the other, outside of any transform, so that functions of all
-    kinds will do.
+    And how large the gradient is at a point, in the root of its mean square, the largest entry; and
+    whether all values are the same. In units of sigma. One call after the other, outside of any
+    transform, so that functions of all kinds will do.
     """
     u = jnp.stack([z, -z], axis=1).reshape(-1, z.shape[1])
     ends = params.theta[None] + params.sigma[None] * u
@@ -235,7 +239,7 @@ def _evaluated(
     usual = float(np.max(np.sqrt(np.mean(each**2, axis=(0, 1)))))
     rounding = 8 * float(jnp.finfo(params.theta.dtype).eps) * np.max(np.abs(pairs))
     half = (pairs[:, 0] - pairs[:, 1]) / 2
-    return half, each.mean(axis=1), float(rounding), usual
+    return half, each.mean(axis=1), float(rounding), usual, bool(np.ptp(pairs) == 0)
 
 
 def _check(value: Any, slope: PyTree, y: PyTree[Array]) -> None:

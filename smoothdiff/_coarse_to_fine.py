@@ -5,17 +5,17 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import PyTree
 
+from smoothdiff._levels import CoarseToFine, Level, check_levels
 from smoothdiff._limits import NoRoomError
 from smoothdiff._params import as_key
 from smoothdiff._result import Record, Result
-from smoothdiff._solvers import AbstractSmoothSolver
 
 # a coarse level ends where the lowest value fell by less than this share within its patience, which
 # is counted in evaluations per parameter and one more
@@ -24,71 +24,6 @@ _TINY = 1e-300
 # why all ends with a level; and why the finest one does where it found what it could
 _ENDED = "interrupted", "max_evaluations", "max_seconds"
 _WELL = "converged", "stalled", "noise"
-
-
-class Level(NamedTuple):
-    """A version of a function, and what an evaluation of it costs.
-
-    Attributes:
-        fun: as for `minimise` or `least_squares`. The residuals of two levels may differ in number.
-        cost: in any unit that all levels share: seconds, rays, time steps.
-
-    Example:
-        >>> import jax.numpy as jnp, smoothdiff as sd
-        >>> def drawn(pixels):
-        ...     x = (jnp.arange(pixels) + 0.5) / pixels
-        ...     bar = lambda y: (x < y).astype(float)
-        ...     return sd.Level(lambda y, args: bar(y) - bar(0.7), cost=pixels)
-        >>> [drawn(pixels).cost for pixels in (16, 256)]
-        [16, 256]
-
-    Source: own.
-    """
-
-    fun: Callable[..., Any]
-    cost: float
-
-
-@dataclasses.dataclass(frozen=True)
-class CoarseToFine:
-    """What `coarse_to_fine` found.
-
-    Attributes:
-        levels: the result of each search, the coarsest level's first. The finest level may have
-            two.
-        evaluations: of each level that was reached.
-        cost: what all evaluations cost together, in evaluations of the finest level.
-        reason: why the search ended, as in `Result`; or "max_cost".
-
-    Example:
-        >>> import jax, jax.numpy as jnp, smoothdiff as sd
-        >>> def drawn(pixels):
-        ...     x = (jnp.arange(pixels) + 0.5) / pixels
-        ...     bar = lambda y: (x < y).astype(float)
-        ...     return sd.Level(lambda y, args: bar(y) - bar(0.7), cost=pixels)
-        >>> found = sd.coarse_to_fine(
-        ...     sd.least_squares, [drawn(16), drawn(64)], 0.4, key=jax.random.key(0), bounds=(0, 1)
-        ... )
-        >>> len(found.levels), round(float(found.y), 1)
-        (2, 0.7)
-
-    Source: own.
-    """
-
-    levels: tuple[Result, ...]
-    evaluations: tuple[int, ...]
-    cost: float
-    reason: str
-
-    @property
-    def y(self) -> PyTree:
-        """The best point of the finest level that was reached."""
-        return self.levels[-1].y
-
-    @property
-    def fun(self) -> float:
-        """The value there of that level's function."""
-        return self.levels[-1].fun
 
 
 def coarse_to_fine(
@@ -132,7 +67,9 @@ def coarse_to_fine(
         max_seconds: seconds after which no further step begins.
         callback: called with each step's `Record`; the search ends if it returns something true.
         **options: as for the minimiser: `bounds`, `space`, `sigma`, `solver`, `support`,
-            `progress`, `takes_key`. Sigma and a solver are for the coarsest level.
+            `progress`, `takes_key`. Sigma and a solver are for the coarsest level; later ones have
+            a smaller sigma. The steps of the default solver are smaller with it. Those of a
+            `FirstOrder` that you give are as large as its `optim` makes them, on all levels.
 
     Returns:
         A `CoarseToFine`.
@@ -156,7 +93,7 @@ def coarse_to_fine(
 
     Source: own; continuation from coarse to fine as for image pyramids (Burt and Adelson, 1983).
     """
-    _check(levels, max_cost, options)
+    check_levels(levels, max_cost, options)
     unit = float(levels[-1].cost)
     search = _Search(minimiser, unit, args, as_key(key), max_cost, max_seconds, options)
     y = y0
@@ -249,16 +186,17 @@ class _Search:
         return self.max_cost is None or self._left(level) >= needed + more
 
     def narrower(self, share: float):
-        """The next level has the same solver, whose sigma is smaller; cost is a `share` of its."""
+        """The next level has a smaller sigma; cost is a `share` of its."""
         found = self.results[-1]
         if self._squares():
             # residuals that are left are as far away as they are large
             share = max(share, found.fun / max(found.history[0].fun, found.fun, _TINY))
         sigma = jax.tree.map(lambda s: s * math.sqrt(share), found.solver.sigma)
-        solver = dataclasses.replace(found.solver, sigma=sigma)
-        # a support is the default solver's, which has it now
-        rest = {name: each for name, each in self.options.items() if name != "support"}
-        self.options = rest | {"solver": solver, "sigma": None}
+        if self.options.get("solver") is None:
+            # of the default solver more than sigma depends on it, and on whether there is a target
+            self.options |= {"sigma": sigma}
+        else:
+            self.options |= {"solver": dataclasses.replace(found.solver, sigma=sigma)}
 
     @property
     def looks(self) -> int:
@@ -299,21 +237,3 @@ def _patience(level: Level, dearer: Level, y: PyTree) -> int:
     """Evaluations that cost what the next level begins with."""
     n = sum(jnp.size(leaf) for leaf in jax.tree.leaves(y))
     return int(min(max(dearer.cost / level.cost, _LEAST), _MOST) * (n + 1))
-
-
-def _check(levels: Any, max_cost: float | None, options: dict[str, Any]):
-    """Raises TypeError or ValueError for levels that are none, and options that have no place."""
-    if not levels or not all(isinstance(level, Level) for level in levels):
-        raise TypeError("levels must be a list of sd.Level(fun, cost), from coarse to fine")
-    costs = [level.cost for level in levels]
-    if not all(0 < a <= b < math.inf for a, b in itertools.pairwise([costs[0], *costs])):
-        raise ValueError(f"the costs of levels must be positive and not fall, not {costs}")
-    if max_cost is not None and not 0 < max_cost < math.inf:
-        raise ValueError(f"max_cost={max_cost} must be a positive number, or None for no limit")
-    for name in options.keys() & {"max_evaluations", "max_steps", "checkpoint"}:
-        raise ValueError(f"{name}= is of one level: use max_cost, max_seconds or target")
-    solver = options.get("solver")
-    if solver is not None and not isinstance(solver, AbstractSmoothSolver):
-        raise TypeError("give the solver itself, such as GaussNewton(sigma), not one around it")
-    if callable(getattr(solver, "sigma", None)):
-        raise ValueError("a solver whose sigma is a schedule cannot be for several levels")

@@ -15,6 +15,7 @@ create table if not exists function (part text primary key, digest text);
 create table if not exists arrays (id text primary key, dtype text, shape text, data blob);
 create table if not exists evaluations (point text primary key, value text);
 """
+_NAMES = {"function", "arrays", "evaluations"}
 
 
 def connected(path: Path) -> sqlite3.Connection:
@@ -31,6 +32,7 @@ def make(path: Path) -> None:
     while True:
         try:
             with translated(path), contextlib.closing(connected(path)) as file:
+                tables(file, path)
                 # others read while one writes
                 file.execute("pragma journal_mode = wal")
                 file.executescript(_TABLES)
@@ -44,12 +46,30 @@ def make(path: Path) -> None:
             time.sleep(0.01)
 
 
+def tables(file: sqlite3.Connection, path: Path) -> set[str]:
+    """The names of those that are there: not all are while the file is being made.
+
+    Raises:
+        ValueError: none of them is ours.
+    """
+    query = "select name from sqlite_master where type = 'table'"
+    names = {name for (name,) in file.execute(query)}
+    if names and not names & _NAMES:
+        raise _no_store(path)
+    return names
+
+
 @contextlib.contextmanager
 def translated(path: Path) -> Iterator[None]:
-    """The error of a file that is none of SQLite's says what to do."""
+    """The error of a file that is none of SQLite's, or has other tables, says what to do."""
     try:
         yield
     except sqlite3.DatabaseError as error:
-        if isinstance(error, sqlite3.OperationalError):  # locked, full, gone
+        other = getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_ERROR  # in its columns
+        if isinstance(error, sqlite3.OperationalError) and not other:  # locked, full, gone
             raise
-        raise ValueError(f"{path} is not a store of evaluations: name another file") from error
+        raise _no_store(path) from error
+
+
+def _no_store(path: Path) -> ValueError:
+    return ValueError(f"{path} is not a store of evaluations: name another file")

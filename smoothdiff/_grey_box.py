@@ -106,8 +106,8 @@ def train_grey_box(
         A `GreyResult`. Ctrl-C ends the training and returns what there is.
 
     Raises:
-        GreyBoxError: a black box failed. Its `result` has what was found, and the checkpoint is
-            written.
+        GreyBoxError: a black box failed, or no render of the first round was finite. Its `result`
+            has what was found, and the checkpoint is written.
         TypeError, ValueError: an argument that cannot work; a checkpoint of another problem.
 
     Example:

@@ -114,6 +114,6 @@ class Lessons(eqx.Module):
 
 
 def mean_loss(known: Known) -> Float[Array, ""]:
-    """Of the best that was rendered of each case, of those that had a render."""
+    """Of the best that was rendered of each case, of those that had a render; else infinite."""
     there = jnp.isfinite(known.loss)
-    return jnp.mean(known.loss, where=there)
+    return jnp.where(there.any(), jnp.mean(known.loss, where=there), jnp.inf)

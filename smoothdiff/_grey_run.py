@@ -1,6 +1,7 @@
 """A training in progress: its state, its rounds, and how it is saved and taken up again."""
 
 import dataclasses
+import math
 import os
 import time
 import warnings
@@ -15,7 +16,7 @@ from jaxtyping import Array, Int, Key, PyTree
 from smoothdiff._checkpoint import Checkpoint
 from smoothdiff._grey_cases import CaseSearches, Known, Rendered, lessons_among
 from smoothdiff._grey_lessons import Learner, Lessons, mean_loss
-from smoothdiff._grey_result import GreyRecord, GreyResult
+from smoothdiff._grey_result import GreyBoxError, GreyRecord, GreyResult
 from smoothdiff._grey_sensitivity import Moved, Sensitivity
 from smoothdiff._identity import listed
 from smoothdiff._layout import Layout
@@ -90,9 +91,19 @@ class GreyRun:
         return time.monotonic() - self.start
 
     def round(self) -> GreyRecord:
-        """Steps of some cases, and lessons of the network."""
+        """Steps of some cases, and lessons of the network.
+
+        Raises:
+            GreyBoxError: it is the first one, and nothing is known after it.
+        """
         with reraise():
             new, record = jax.block_until_ready(self._round())
+        if self.rounds == 0 and record.known == math.inf:
+            raise GreyBoxError(
+                "no render of the first round was finite: see what render(model(pictures[0])) is, "
+                "and begin with a network whose answers can be rendered, or take a smaller sigma",
+                self.found("failed"),
+            )
         # Ctrl-C may come between any two lines: the state has the last word on what was done
         self.history = [*self.history[: self.rounds], record]
         self.state = new

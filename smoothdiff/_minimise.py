@@ -52,7 +52,8 @@ def minimise(
     again. A parameter that changes nothing stays where it was.
 
     But for rounding, the iterates are those of `optimistix.minimise(fun, solver, y0, args,
-    options={"key": key})`, with `"bounds": bounds` in the options if there are any.
+    options={"key": key})`, with `"bounds": bounds` in the options if there are any. That runs
+    inside of `jit` and `vmap` too; this call does not.
 
     With fewer than 100 parameters the function is called between steps, which are compiled once for
     all functions. Otherwise a step is compiled for each function object and solver: pass the same

@@ -238,6 +238,12 @@ class Run:
             width = sigma(self.steps)
             if not all(np.all(np.asarray(leaf) > 0) for leaf in jax.tree.leaves(width)):
                 advice = f"sigma of step {self.steps} is {width}: it must stay above zero"
+        lowest = (progress or self.state.progress).lowest_fun
+        if getattr(self._ours(), "log", False) and lowest < 0:
+            advice = (
+                "log=True is for functions that are never negative, and fun is negative somewhere: "
+                "leave it out"
+            )
         dtype = self.state.progress.lowest_fun.dtype
         if overflowed and self._is_of_residuals() and jnp.finfo(dtype).bits < 64:
             advice += _OVERFLOW.format(dtype)

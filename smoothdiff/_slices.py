@@ -14,6 +14,7 @@ from smoothdiff._params import Params, take_apart
 from smoothdiff._ranges import Integer
 from smoothdiff._samplers import Sobol
 from smoothdiff._smooth import smooth
+from smoothdiff._solvers._evaluator import called
 from smoothdiff._spaces import AbstractSpace
 from smoothdiff._unbounded import Periodic
 from smoothdiff._unit_space import UnitSpace
@@ -85,8 +86,9 @@ class Slices:
                 f"there are {len(names)} labels for {len(units.labels())} parameters: give one for "
                 "each"
             )
-        wrapped = units.wrap(fun)
-        out = jax.eval_shape(lambda u: jax.tree.map(jnp.asarray, wrapped(u, args)), start)
+        natural = units.wrap(fun)
+        wrapped = lambda u, args: called(natural, u, args)
+        out = jax.eval_shape(wrapped, start, args)
         if [leaf.shape for leaf in jax.tree.leaves(out)] != [()]:
             raise TypeError(
                 f"{returned(out)}; it must return one number: for residuals, give "
@@ -135,10 +137,11 @@ class Slices:
             ValueError: there is none of that position or label; its sigma is None.
         """
         known = self.labels.index(parameter) if parameter in self.labels else parameter
-        if isinstance(known, str) or not -len(self.labels) <= known < len(self.labels):
+        count = len(self.labels)
+        if not isinstance(known, int | np.integer) or not -count <= known < count:
             shown = ", ".join(self.labels[:_MOST])
             raise ValueError(f"there is no parameter {parameter!r}: the parameters are {shown}")
-        j = known % len(self.labels)
+        j = int(known) % count
         if not self._smoothed()[j]:
             raise ValueError(
                 f"the parameter {self.labels[j]} is not smoothed: give it a sigma, or a space"

@@ -11,7 +11,7 @@ from jaxtyping import Array, PyTree
 from tqdm import tqdm
 
 from smoothdiff._black_box import UnknownOutputError
-from smoothdiff._call_checks import check_call, check_solver, explained
+from smoothdiff._call_checks import check_call, check_solver, check_untraced, explained
 from smoothdiff._ctrl_c import ctrl_c_noticed, is_ctrl_c, raise_if_pressed
 from smoothdiff._default_solver import default_solver, share_of_range
 from smoothdiff._host_problem import HostProblem
@@ -81,6 +81,9 @@ def solve(
         MinimiseError, TypeError, ValueError: as `minimise` says.
     """
     (solver, sigma, support), (space, bounds, takes_key) = chosen, where
+    residuals = kind.solvers is optx.AbstractLeastSquaresSolver
+    name = "least_squares" if residuals else "minimise"
+    check_untraced(name, kind.example, (y0, args, key, chosen, where))
     check_call(fun, y0, bounds, space, takes_key)
     fun, args = keyed(fun, args, key) if takes_key else (fun, args)
     units, anywhere = UnitSpace.of(y0, space), sigma is None
@@ -89,7 +92,6 @@ def solve(
         bounds = units.bounds()
     y = jax.tree.map(inexact, y0)
     if solver is None:
-        residuals = kind.solvers is optx.AbstractLeastSquaresSolver
         if space is not None and sigma is None:
             sigma = units.sigma(share_of_range(y, bounds, residuals, support))
         until = limits[-1] is not None and not takes_key

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from smoothdiff._database import connected, make, translated
+from smoothdiff._database import connected, make, tables, translated
 from smoothdiff._digest import digest_of
 from smoothdiff._host_samples import Samples
 from smoothdiff._identity import Identity, can_change, listed
@@ -49,7 +49,8 @@ class Evaluation(NamedTuple):
 def load_store(path: str | os.PathLike) -> list[Evaluation]:
     """The evaluations in the file of a `black_box(..., store=path)`, in the order they came.
 
-    The file can be read while it grows. It is an SQLite database without pickles.
+    The file can be read while it grows. It is an SQLite database without pickles. An empty file is
+    a store that is about to be made, and has no evaluations.
 
     Args:
         path: the file.
@@ -60,7 +61,7 @@ def load_store(path: str | os.PathLike) -> list[Evaluation]:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is another kind of file.
+        ValueError: it is another kind of file, or a directory.
 
     Example:
         >>> import tempfile, jax, jax.numpy as jnp, numpy as np, smoothdiff as sd
@@ -80,9 +81,14 @@ def load_store(path: str | os.PathLike) -> list[Evaluation]:
 
     Source: own.
     """
-    if not Path(path).exists():
+    path = Path(path)
+    if not path.exists():
         raise FileNotFoundError(f"there is no store {path}")
-    with translated(Path(path)), contextlib.closing(connected(Path(path))) as file:
+    if path.is_dir():
+        raise ValueError(f"{path} is a directory: name the file of a store")
+    with translated(path), contextlib.closing(connected(path)) as file:
+        if "evaluations" not in tables(file, path):
+            return []
         rows = file.execute("select point, value from evaluations order by rowid").fetchall()
         return [Evaluation(*(_read(file, text).tree() for text in row)) for row in rows]
 

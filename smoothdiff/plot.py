@@ -113,7 +113,8 @@ def slice(
     `num_samples` + 1 evaluations.
 
     Args:
-        fun: the function, `fun(y, args)`, which returns one number. May contain a black box.
+        fun: the function, `fun(y, args)`, which returns one number, as for `minimise`. May contain
+            a black box.
         y: the point, such as `result.y`: a pytree of numbers and arrays, in natural values.
         args: passed on to `fun`.
         sigma: the smoothing width of all parameters, as for `smooth`. With a space it is in unit

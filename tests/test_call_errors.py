@@ -3,11 +3,13 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix
 import pytest
 
 import smoothdiff as sd
 
 KEY = jax.random.key(0)
+START, GRID = jnp.zeros(2), jnp.array([[0.0, 0.0], [3.0, -1.0]])
 
 
 def bowl(y, args):
@@ -22,6 +24,44 @@ def message(error, call):
     with pytest.raises(error) as info:
         call()
     return str(info.value)
+
+
+# JAX's transformations
+
+TRACED = {
+    "start": lambda y: sd.minimise(bowl, y, key=KEY),
+    "argument": lambda y: sd.minimise(lambda y, args: bowl(y, args) + args, START, y[0], key=KEY),
+    "bounds": lambda y: sd.minimise(bowl, START, key=KEY, bounds=(-y, y)),
+    "sigma": lambda y: sd.minimise(bowl, START, key=KEY, sigma=y),
+    "solver": lambda y: sd.minimise(bowl, START, key=KEY, solver=sd.NewtonCG(y)),
+}
+
+
+@pytest.mark.parametrize("transform", [jax.jit, jax.vmap])
+@pytest.mark.parametrize("name", TRACED)
+def test_a_call_that_is_traced_says_what_to_call(name, transform):
+    run = transform(lambda y: TRACED[name](y).y)
+    text = message(TypeError, lambda: run(jnp.ones((2, 2))))
+    assert "call optimistix.minimise(fun, solver, y0, args, " in text
+
+
+def test_under_jit_it_says_so_where_the_function_alone_is_traced():
+    hidden = lambda a: sd.minimise(lambda y, args: bowl(y, args) + a, START, key=KEY).y
+    assert "outside of jit" in message(TypeError, lambda: jax.jit(hidden)(1.0))
+
+
+def test_what_it_says_to_call_works_there():
+    residuals = lambda y, args: y - args
+    text = message(
+        TypeError, lambda: jax.vmap(lambda y: sd.least_squares(residuals, y, 1.0, key=KEY).y)(GRID)
+    )
+    call = 'optimistix.least_squares(fun, solver, y0, args, options={"key": key})'
+    assert call in text
+    assert "sd.GaussNewton(sigma)" in text
+    names = {"optimistix": optimistix, "fun": residuals, "args": 1.0, "key": KEY}
+    names["solver"] = sd.GaussNewton(0.3)
+    inside = jax.jit(jax.vmap(lambda y: eval(call, names | {"y0": y}).value))
+    np.testing.assert_allclose(inside(GRID), 1, atol=1e-3)
 
 
 # bounds

@@ -140,6 +140,21 @@ def test_what_rounding_hides_is_not_called_right():
     assert found.low < 0 < found.high
 
 
+@pytest.mark.parametrize(("claimed", "passed"), [(0.0, True), (0.1, False)])
+def test_of_a_constant_the_gradient_is_zero(claimed, passed, key):
+    slope = lambda y: np.full(2, claimed)
+    found = sd.check_gradient(slope, lambda y: 3.0, jnp.ones(2), 0.5, key=key, num_samples=64)
+    assert found.passed == passed
+
+
+@pytest.mark.parametrize("claimed", [0.0, 0.1])
+def test_a_slope_that_rounding_all_but_hides_is_undecided(claimed, key):
+    """A sigma along it is less than the spacing of float32 beside a million."""
+    beside = lambda y: np.float32(1e6) + np.float32(0.1) * np.asarray(y)
+    found = sd.check_gradient(lambda y: claimed, beside, 0.0, 0.5, key=key, num_samples=64)
+    assert found.undecided
+
+
 @pytest.mark.parametrize(
     ("changed", "message"),
     [

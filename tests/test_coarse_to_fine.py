@@ -229,6 +229,56 @@ def test_a_support_is_for_all_levels():
     assert len(found.levels) == 2
 
 
+def test_steps_are_as_narrow_as_sigma_on_each_level():
+    """Of many parameters the first step of Adam is 0.15 sigma in each."""
+    bowl = lambda y, args: 1.0 + jnp.sum((y - 1) ** 2)
+    levels, start = [sd.Level(bowl, 1), sd.Level(bowl, 64)], jnp.full(120, 0.5)
+    search = as_users_have_it(sd.coarse_to_fine)
+    found = search(sd.minimise, levels, start, key=KEY, sigma=0.2, max_cost=200)
+    coarse, fine = found.levels
+    np.testing.assert_allclose(fine.solver.sigma, 0.2 / 8, rtol=1e-6)
+    first = np.abs(fine.history[0].y - coarse.y)
+    np.testing.assert_allclose(np.max(first) / (0.2 / 8), 0.15, rtol=0.01)
+
+
+def test_with_a_target_one_search_follows_another_on_the_finest_level():
+    """The coarse levels end in one of a hundred local minima."""
+    ripples = lambda y, args: jnp.sum(y**2) / 10 + 2 * jnp.sum(1 - jnp.cos(3 * y))
+    levels = [sd.Level(ripples, 1), sd.Level(ripples, 4)]
+    options = {"key": KEY, "bounds": (-8.0, 12.0), "target": 0.01}
+    found = sd.coarse_to_fine(sd.minimise, levels, jnp.array([7.0, 9.0]), **options)
+    assert found.reason == "target"
+    assert found.fun <= 0.01
+
+
+def test_switches_are_searched_as_switches_on_each_level():
+    """Within bounds, without a sigma, the default for terms of few parameters."""
+    lit = jnp.arange(8.0) % 2
+    display = sd.Level(lambda y, args: (y > 0.5).astype(float) - lit, 1)
+    found = sd.coarse_to_fine(
+        sd.least_squares,
+        [display, display._replace(cost=2)],
+        jnp.full(8, 0.5),
+        key=KEY,
+        support=sd.local_support(0, ndim=1),
+        bounds=(0.0, 1.0),
+        max_cost=400,
+    )
+    assert [type(each.solver) for each in found.levels] == [sd.LocalCrossEntropy] * 2
+    assert found.fun == 0
+
+
+def test_a_solver_that_is_given_is_that_of_all_levels():
+    levels = [bowls()[0].level, bowls()[2].level]
+    solver = sd.GaussNewton(0.5, num_samples=2)
+    found = sd.coarse_to_fine(
+        sd.least_squares, levels, jnp.array([3.0, 3.0]), key=KEY, solver=solver
+    )
+    assert [each.solver.num_samples for each in found.levels[:2]] == [2, 2]
+    assert found.levels[0].solver.sigma == 0.5
+    assert found.levels[1].solver.sigma < 0.5
+
+
 @pytest.mark.parametrize(
     ("levels", "options", "error", "message"),
     [
@@ -245,6 +295,7 @@ def test_a_support_is_for_all_levels():
             ValueError,
             "schedule",
         ),
+        ([bowls()[0].level], {"sigma": lambda step: 0.1}, ValueError, "schedule"),
         (
             [bowls()[0].level],
             {"solver": optx.BestSoFarLeastSquares(sd.GaussNewton(0.1))},

@@ -17,6 +17,7 @@ from smoothdiff._solvers._base import Progress, project
 
 KEY = jax.random.key(2)
 TARGET = jnp.array([0.6, -0.4])
+SAM = optax.contrib.sam(optax.sgd(0.1), optax.sgd(0.05))
 SUCCESS, MAX_STEPS, NONFINITE = (
     optx.RESULTS.successful,
     optx.RESULTS.nonlinear_max_steps_reached,
@@ -252,6 +253,33 @@ def test_what_is_no_optax_transformation_is_refused():
     factory: Any = optax.adam
     with pytest.raises(TypeError, match="optim"):
         sd.FirstOrder(factory, 0.1)
+    steps: Any = optax.MultiSteps(optax.adam(0.1), 2)
+    with pytest.raises(TypeError, match=r"write optim.gradient_transformation\(\)"):
+        sd.FirstOrder(steps, 0.1)
+    with pytest.raises(TypeError, match=r"write optimizer.gradient_transformation\(\)"):
+        sd.ZeroGrads(0.1, optimizer=steps)
+
+
+@pytest.mark.parametrize(
+    ("optim", "match"),
+    [
+        (optax.lbfgs(), r"ZeroGrads\(sigma, optimizer="),
+        (optax.chain(optax.clip(1.0), optax.lbfgs()), r"ZeroGrads\(sigma, optimizer="),
+        (SAM, r"GradientTransformation\(part.init, part.update\)"),
+        (optax.chain(optax.clip(1.0), SAM), r"GradientTransformation\(part.init, part.update\)"),
+    ],
+)
+def test_a_transformation_that_needs_more_says_what_to_write(optim, match):
+    with pytest.raises(TypeError, match=match):
+        run(bowl, sd.FirstOrder(optim, 0.1), jnp.zeros(2), TARGET)
+
+
+def test_a_transformation_that_takes_no_more_than_others_can_be_wrapped():
+    wrapped = optax.GradientTransformation(SAM.init, SAM.update)
+    result = sd.minimise(
+        bowl, jnp.zeros(2), TARGET, key=jax.random.key(0), solver=sd.FirstOrder(wrapped, 0.1)
+    )
+    np.testing.assert_allclose(result.y, TARGET, atol=0.1)
 
 
 # the shared parts

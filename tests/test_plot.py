@@ -265,6 +265,7 @@ def test_a_black_box_is_called_as_often_as_is_said(ax):
     [
         (ValueError, r"no parameter 2: the parameters are y\[0\], y\[1\]", {"parameter": 2}),
         (ValueError, "no parameter 'mass'", {"parameter": "mass"}),
+        (ValueError, "no parameter 0.5", {"parameter": 0.5}),
         (ValueError, "1 labels for 2 parameters", {"labels": ["x"]}),
         (ValueError, "give sigma=", {"sigma": None}),
         (ValueError, "points=2", {"points": 2}),
@@ -276,6 +277,17 @@ def test_what_a_slice_refuses(error, message, options):
     fun = lambda y, args: jnp.sum(y)
     with pytest.raises(error, match=message):
         sd.plot.slice(fun, jnp.ones(2), **{"sigma": 0.1, "key": jax.random.key(0)} | options)
+
+
+def test_a_slice_of_a_count(ax):
+    count = lambda y, args: jnp.sum(y > 0.5)
+    sd.plot.slice(
+        count, jnp.ones(2), sigma=0.1, key=jax.random.key(0), parameter=0, points=5, ax=ax
+    )
+    function = ax.get_lines()[1]
+    np.testing.assert_array_equal(
+        function.get_ydata(), [1 + (x > 0.5) for x in function.get_xdata()]
+    )
 
 
 def test_a_slice_of_no_number_or_of_too_many():

@@ -1,6 +1,7 @@
 """A store of evaluations: what is in it is never paid for again, whatever ended the run."""
 
 import concurrent.futures
+import contextlib
 import shutil
 import sqlite3
 import subprocess
@@ -420,6 +421,42 @@ def test_a_file_that_is_no_store(content, tmp_path):
         sd.load_store(tmp_path / "nowhere")
     with pytest.raises(TypeError, match="store must be a path"):
         as_users_have_it(sd.black_box)(Counted(), 0.0, store=True)
+
+
+@pytest.mark.parametrize("table", ["notes (text)", "evaluations (at, score)"])
+def test_the_file_of_another_program_is_left_alone(table, tmp_path):
+    path = tmp_path / "theirs.db"
+    with contextlib.closing(sqlite3.connect(path)) as file:
+        file.execute(f"create table {table}")
+    content = path.read_bytes()
+    with pytest.raises(ValueError, match="is not a store of evaluations: name another file"):
+        sd.load_store(path)
+    assert path.read_bytes() == content
+
+
+def test_nothing_is_added_to_the_tables_of_another_program(tmp_path):
+    path = tmp_path / "theirs.db"
+    with contextlib.closing(sqlite3.connect(path)) as file:
+        file.execute("create table notes (text)")
+    with pytest.raises(ValueError, match="is not a store of evaluations: name another file"):
+        sd.black_box(Counted(), 0.0, store=path)(1.0)
+    with contextlib.closing(sqlite3.connect(path)) as file:
+        assert file.execute("select name from sqlite_master").fetchall() == [("notes",)]
+
+
+@pytest.mark.parametrize("made", [[], ["function"], ["function", "arrays"]])
+def test_a_store_that_is_being_made_is_empty(made, tmp_path):
+    path = tmp_path / "store.db"
+    path.touch()
+    with contextlib.closing(sqlite3.connect(path)) as file:
+        for table in made:
+            file.execute(f"create table {table} (id)")
+    assert sd.load_store(path) == []
+
+
+def test_a_directory_is_no_store(tmp_path):
+    with pytest.raises(ValueError, match="is a directory"):
+        sd.load_store(tmp_path)
 
 
 # what it is for

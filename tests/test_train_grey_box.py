@@ -12,8 +12,9 @@ import pytest
 
 import smoothdiff as sd
 from smoothdiff._grey_cases import Known, Rendered, lessons_among, like, usual_range
-from smoothdiff._grey_lessons import Lessons
+from smoothdiff._grey_lessons import Lessons, mean_loss
 from smoothdiff._grey_sensitivity import Moved, Sensitivity
+from tests.parts import quick_of
 
 DRAWING = np.array([[1.0, -2.0], [0.5, 0.3], [0.2, 0.4], [-1.0, 0.1]])
 POSES = np.random.default_rng(1).normal(size=(16, 2))
@@ -187,6 +188,24 @@ def test_a_black_box_that_breaks_loses_nothing(tmp_path):
     assert error.value.result.evaluations == 16 * 2 * EACH
     assert np.isfinite(error.value.result.losses).all()
     assert (tmp_path / "grey.npz").exists()
+
+
+@pytest.mark.parametrize("parts", quick_of([{"kept": 64}, {"kept": 0}], [{"kept": 64}]))
+def test_a_renderer_that_always_fails_ends_the_training(parts, tmp_path):
+    """In the first round, before all renders are spent, and nothing of it is kept."""
+    nothing = lambda at: jnp.full((2, 2), jnp.nan, at["x"].dtype)
+    path = tmp_path / "grey.npz"
+    with pytest.raises(sd.GreyBoxError, match="no render of the first round was finite") as error:
+        train(nothing, checkpoint=path, **parts)
+    assert error.value.result.reason == "failed"
+    assert error.value.result.history == []
+    assert not path.exists()
+
+
+def test_the_loss_of_no_known_case_is_infinite():
+    best, loss = jnp.zeros((3, 1)), jnp.array([1.0, jnp.inf, 3.0])
+    assert mean_loss(Known(best, loss, best, None)) == 2
+    assert mean_loss(Known(best, jnp.full(3, jnp.inf), best, None)) == jnp.inf
 
 
 def test_new_parameters_are_spread_like_those_found(key):

@@ -285,6 +285,13 @@ def test_drop_leaves_failed_samples_out():
     assert quick(HOLES).result == NONFINITE
 
 
+@pytest.mark.parametrize("nonfinite", ["propagate", "drop"])
+def test_the_logarithm_of_a_negative_function_is_named(nonfinite):
+    solver = ZeroGrads(0.3, log=True, nonfinite=nonfinite)
+    with pytest.raises(sd.MinimiseError, match="log=True is for functions that are never negative"):
+        sd.minimise(lambda y, args: bowl(y, args) - 5, TARGET, TARGET, key=KEY, solver=solver)
+
+
 def test_without_locality_it_samples_all_that_is_within_the_bounds():
     low, high = jnp.array([-1.0, 2.0]), jnp.array([1.0, 6.0])
     solver = ZeroGrads(0.1, local=False, num_samples=2000)

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float, PyTree
 
 from smoothdiff._params import Params
 from smoothdiff._solvers._base import project, promotion
+from smoothdiff._solvers._optax import updated
 
 # the default rate, in units of sigma
 _RATE = 0.05
@@ -17,7 +18,7 @@ def descended(
     height: Callable[[PyTree], Float[Array, ""]],
     y: PyTree[Array],
     opt_state: PyTree,
-    optim: optax.GradientTransformationExtraArgs,
+    optim: optax.GradientTransformation,
     bounds: tuple[PyTree, PyTree] | None,
     *,
     length: int,
@@ -28,9 +29,7 @@ def descended(
         y, opt_state = carry
         value, grad = jax.value_and_grad(height)(y)
         with promotion():
-            updates, opt_state = optim.update(
-                grad, opt_state, y, value=value, grad=grad, value_fn=height
-            )
+            updates, opt_state = updated(optim, grad, opt_state, y, value=value, value_fn=height)
             return (project(optax.apply_updates(y, updates), bounds), opt_state), None
 
     return jax.lax.scan(update, (y, opt_state), length=length)[0]
@@ -38,14 +37,14 @@ def descended(
 
 def as_optimizer(
     optim: optax.GradientTransformation | None, params: Params
-) -> optax.GradientTransformationExtraArgs:
+) -> optax.GradientTransformation:
     """The user's transformation; without one Adam, in units of each parameter's sigma."""
     if optim is not None:
-        return optax.with_extra_args_support(optim)
+        return optim
     adam, layout, sigma = optax.adam(_RATE), params.layout, params.sigma
 
-    def update(updates, state, params=None, **extra_args):
+    def update(updates, state, params=None):
         updates, state = adam.update(updates, state, params)
         return layout.tree(sigma * layout.vector(jax.tree.leaves(updates))), state
 
-    return optax.GradientTransformationExtraArgs(adam.init, update)
+    return optax.GradientTransformation(adam.init, update)

@@ -30,6 +30,7 @@ from smoothdiff._solvers._base import (
     unless_failed,
 )
 from smoothdiff._solvers._judgement import judged, judging, one_by_one
+from smoothdiff._solvers._optax import check_optax, updated
 from smoothdiff._solvers._path_length import PathLength, steps_scaled
 from smoothdiff._solvers._random_numbers import in_step
 
@@ -97,7 +98,8 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
         norm: the norm of updates and iterates.
 
     Raises:
-        TypeError: an `optim` that is no optax transformation.
+        TypeError: an `optim` that is no optax transformation; when it runs, one that asks for the
+            function itself.
         ValueError: when it runs, what `smooth` refuses: a sigma, a number of samples or a baseline
             that does not go with the parameters.
 
@@ -131,10 +133,7 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
 
     def __check_init__(self):
         check_settings(self)
-        if not isinstance(self.optim, optax.GradientTransformation):
-            raise TypeError(
-                f"optim must be an optax transformation such as optax.adam(0.1): {self.optim}"
-            )
+        check_optax(self.optim, "optim")
 
     def evaluations_per_step(self, y: PyTree[Array]) -> int:
         """One batch."""
@@ -197,9 +196,8 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
         params, scale, sigma = self._scaled(y, state, options)
         estimate = self._estimator(fn, args, progress.step, options, sigma)
         (fun, (stderr, seen)), grad = jax.value_and_grad(estimate, has_aux=True)(y)
-        optim = optax.with_extra_args_support(self.optim)
         with promotion():
-            updates, opt_state = optim.update(grad, state.opt_state, y, value=fun, grad=grad)
+            updates, opt_state = updated(self.optim, grad, state.opt_state, y, value=fun)
             if scale is not None:
                 updates = steps_scaled(updates, params, scale)
             new_y = optax.apply_updates(y, updates)

@@ -29,6 +29,7 @@ from smoothdiff._solvers._base import (
 from smoothdiff._solvers._descent import as_optimizer, descended
 from smoothdiff._solvers._judgement import judged, judging, one_by_one
 from smoothdiff._solvers._locality import Locality, check_box, inner_width, log, share
+from smoothdiff._solvers._optax import check_optax
 from smoothdiff._solvers._random_numbers import in_step
 from smoothdiff._solvers._replay import Replay
 from smoothdiff._solvers._surrogate_fit import Fit, Settings
@@ -150,11 +151,9 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
 
     def __check_init__(self):
         check_settings(self)
-        for name in ("surrogate_optimizer", "optimizer"):
-            optim = getattr(self, name)
-            left_out = optim is None and name == "optimizer"
-            if not left_out and not isinstance(optim, optax.GradientTransformation):
-                raise TypeError(f"{name} must be one of optax, as optax.adam(1e-3) is: {optim}")
+        check_optax(self.surrogate_optimizer, "surrogate_optimizer")
+        if self.optimizer is not None:
+            check_optax(self.optimizer, "optimizer")
         for name in ("surrogate_steps", "parameter_steps"):
             steps = getattr(self, name)
             if steps is not None and steps < 1:

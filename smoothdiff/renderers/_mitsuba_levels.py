@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from smoothdiff._coarse_to_fine import Level
+from smoothdiff._levels import Level
 from smoothdiff.renderers._mitsuba_renderer import renderer
 
 # fewer samples of a picture than this cost what the call costs
