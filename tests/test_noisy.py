@@ -2,6 +2,7 @@
 
 import itertools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,9 +12,10 @@ import pytest
 from closed_forms import as_users_have_it
 
 import smoothdiff as sd
-from smoothdiff._solvers._averaging import Average, apart
+from smoothdiff._solvers._averaging import Average, apart, seen_from_center
 from smoothdiff._solvers._judgement import _clear_winner
-from smoothdiff._solvers._wide_rounds import _noise_and_signal
+from smoothdiff._solvers._stages import Sizes
+from smoothdiff._solvers._wide_rounds import Wide, _noise_and_signal
 
 KEY = jax.random.key(3)
 TIMES = jnp.linspace(0, 4, 20)
@@ -240,6 +242,24 @@ def test_fresh_numbers_find_more_than_fixed_ones(minimise, fun, gap, solver, arg
     assert find(True) < 0.2 * find(False)
 
 
+def light(y, args, key):
+    """Residuals: light along a line, far less of it from farther away, with noise."""
+    of = lambda y: 1 / (0.3 + (jnp.linspace(0, 1, 40) - y[0]) ** 2 + y[1] ** 2)
+    return of(y) * (1 + 0.1 * jax.random.normal(key, (40,))) - of(args)
+
+
+@pytest.mark.slow
+def test_curved_residuals_do_not_move_the_answer():
+    """By a regression over samples alone it was 0.006 nearer, as the mean over them is another."""
+    lamp, bounds = jnp.array([0.3, 0.3]), (jnp.zeros(2), jnp.array([2.5, 1.5]))
+    call = {"bounds": bounds, "takes_key": True, "max_evaluations": 400}
+    find = lambda seed: sd.least_squares(
+        light, jnp.array([1.5, 0.7]), lamp, key=jax.random.key(seed), **call
+    )
+    away = np.array([find(seed).y - lamp for seed in range(6)])
+    assert np.all(np.abs(np.mean(away, axis=0)) < 0.003)
+
+
 @pytest.mark.slow
 def test_a_function_that_ignores_the_key_has_no_noise():
     flat = lambda y, args, key: jnp.sum((y - args) ** 2)
@@ -307,6 +327,47 @@ def test_samples_are_so_far_apart_that_they_differ_by_the_noise():
     assert width(0.1, 2.0, 0.0) == pytest.approx(0.15)
     assert width(0.1, 0.0, 2.0) == pytest.approx(0.025)
     assert width(0.9, 2.0, 1.0) == 1
+
+
+def test_samples_say_how_residuals_change_and_the_center_what_they_are():
+    random = np.random.default_rng(1)
+    points, slopes = random.normal(size=(12, 2)), random.normal(size=(2, 5))
+    there = np.arange(12) < 3
+    points[there] = 0
+    rows = 1 + points @ slopes + np.where(there, 0, 7)[:, None]  # curved alike to all sides
+    rows = rows + np.where(there, random.normal(size=12), 0)[:, None]
+    valid = np.arange(12) != 11
+    points, rows = points.astype(np.float32), rows.astype(np.float32)
+    points, rows, valid, there = map(jnp.asarray, (points, rows, valid, there))
+    u, seen, used = jax.jit(seen_from_center)(points, rows, valid, there)
+    np.testing.assert_array_equal(used, valid & ~there)
+    fit = np.linalg.lstsq(np.c_[np.ones(12), u][used], seen[used])[0]
+    np.testing.assert_allclose(fit, np.r_[rows[there].mean(axis=0)[None], slopes], rtol=1e-4)
+    # where none of them gave numbers, all is as it was
+    same = seen_from_center(points, rows, valid, jnp.zeros(12, bool))
+    for now, before in zip(same, (points, rows, valid), strict=True):
+        np.testing.assert_allclose(now, before, rtol=1e-6)
+
+
+def test_the_center_comes_every_second_time_after_the_first_rounds():
+    wide = Wide.start(jnp.zeros(2), jnp.zeros(3), jnp.ones(2))
+    later = eqx.tree_at(lambda w: (w.rounds, w.seen), wide, (jnp.asarray(7), jnp.asarray(True)))
+    sizes, at_once = Sizes.of(None, 6, 4, 50), Sizes.of(4, 8, 4, 50)
+
+    def round_of(wide, sizes, takes_key):
+        centers, samples = [], []
+        for taken in range(0, int(wide.size(sizes, takes_key)), sizes.step):
+            at, which = eqx.tree_at(lambda w: w.taken, wide, taken).places(sizes.step, takes_key)
+            centers += at.tolist()
+            samples += which[~at].tolist()
+        return centers, samples
+
+    first = [True] + [False] * 5, list(range(5))
+    assert round_of(wide, sizes, True) == round_of(wide, sizes, False) == first
+    assert round_of(later, sizes, False) == ([True] + [False] * 3, list(range(3)))
+    assert round_of(later, sizes, True) == ([True, False] * 4, list(range(4)))
+    # evaluations at once have the same numbers
+    assert round_of(later, at_once, True) == ([True] + [False] * 3, list(range(3)))
 
 
 # what is told

@@ -3,14 +3,23 @@
 As long as its local model predicts, a search of a function that takes random numbers gives it the
 same ones. Where the model ends, at a minimum of these numbers alone, rounds of samples with fresh
 ones follow, until the run ends. The more rounds, the nearer is the mean of their centers.
+
+After the first rounds residuals are evaluated at the center as often as around it. Those around it
+say how they change, those at the center what they are: the mean over samples is another where they
+are curved.
 """
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
+
+from smoothdiff._products import dot
+from smoothdiff._solvers._residual_batch import centred
 
 # how strongly later centers count: as the power of their number
 _LATER = 3.0
+# the share of a step within the samples that is taken: much of it is noise
+SHARE = 0.5
 # the next samples are so many times as far apart, at most
 _NEARER, _FARTHER = 0.25, 1.5
 
@@ -57,3 +66,21 @@ def apart(
     tiny = jnp.finfo(noise.dtype).tiny
     factor = jnp.clip(noise / jnp.maximum(signal, tiny), _NEARER, _FARTHER)
     return jnp.minimum(factor * width, 1)
+
+
+def seen_from_center(
+    u: Float[Array, "M n"],
+    rows: Float[Array, "M P"],
+    valid: Bool[Array, " M"],
+    there: Bool[Array, " M"],
+) -> tuple[Float[Array, "M n"], Float[Array, "M P"], Bool[Array, " M"]]:
+    """Points and residuals around their means, the residuals on top of those at the center.
+
+    The evaluations `there` are at the center. They count for that alone: otherwise their noise
+    would be in the slopes too, and a product of the two is no zero in the mean.
+    """
+    known, others = jnp.any(there), valid & ~there
+    count = jnp.maximum(jnp.sum(there), 1).astype(rows.dtype)
+    here = dot(there.astype(rows.dtype), rows) / count
+    moved = centred(u, others), here[None] + centred(rows, others), others
+    return tuple(jnp.where(known, a, b) for a, b in zip(moved, (u, rows, valid), strict=True))

@@ -80,17 +80,17 @@ class ResidualSearch(ResidualState):
 
         def wide() -> tuple[Array, Proposal]:
             wide, samples = self.wide, draw(max(sizes.first - 1, 1))
-            at = wide.taken + slot
             width = sigma * wide.scale
-            samples = samples[jnp.clip(at - 1, 0, len(samples) - 1)]
+            at_center, index = wide.places(count, self.average is not None)
+            samples = samples[jnp.clip(index, 0, len(samples) - 1)]
             points = jax.vmap(params.reflected)(wide.center[None] + width[None] * samples)
             step, worth = further(wide.move, width)
             # at the bounds it may be one that is known
             end = params.clip(wide.center + step)
             same = jnp.all(self.history.points == end[None], axis=1) & self.history.valid
             worth &= ~jnp.any(same)
-            points = jnp.where(((at == 1) & worth)[:, None], end[None], points)
-            return jnp.where((at == 0)[:, None], wide.center[None], points), nothing
+            points = jnp.where(((wide.taken + slot == 1) & worth)[:, None], end[None], points)
+            return jnp.where(at_center[:, None], wide.center[None], points), nothing
 
         pilot = lambda: (self.pilot.points(params, self.start, draw, count), nothing)
         branches = [first, local, wide, pilot]
@@ -171,7 +171,7 @@ class ResidualSearch(ResidualState):
         self, params: Params, rows: Array, good: Array, sizes: Sizes
     ) -> "ResidualSearch":
         _, lowest, fun = self.history.best(self.start)
-        wanted = jnp.where(self.wide.seen, sizes.later, sizes.first)
+        wanted = self.wide.size(sizes, self.average is not None)
         wide = self.wide.sampled(params, self.history, rows, good, lowest, fun)
         average, full = self.average, wide.taken >= wanted
         moved = lambda: wide.stepped(self.history, params, wanted, takes_key=average is not None)

@@ -6,10 +6,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
 from smoothdiff._products import dot
-from smoothdiff._solvers._averaging import apart
+from smoothdiff._solvers._averaging import SHARE, apart, seen_from_center
 from smoothdiff._solvers._history import History, alike
 from smoothdiff._solvers._parameter_regression import gauss_newton_step
 from smoothdiff._solvers._residual_batch import centred
+from smoothdiff._solvers._stages import Sizes
 
 # each sigma follows twice the standard error of the step, at most so much smaller or larger at a
 # time
@@ -22,6 +23,8 @@ _NARROWEST = 0.1
 LONGEST = 2.0
 # a step is tried so many times as far, where that is at least sigma
 _FURTHER = 5.0
+# after so many rounds, of so many evaluations with random numbers of their own one is at the center
+_FIRST, _CENTERS = 6, 2
 # so many steps in a row that halve the loss, within the width, came true
 _TRUE = 2
 # rounds come to nothing after so many evaluations, for each parameter and one, that found no lower
@@ -78,6 +81,28 @@ class Wide(eqx.Module):
         narrow = jnp.sqrt(jnp.mean(self.scale**2)) < _NARROW
         return narrow & self.found & (self.true == 0)
 
+    def circles(self) -> Bool[Array, ""]:
+        """Whether the first rounds are over, which may have far to go."""
+        return self.rounds > _FIRST
+
+    def size(self, sizes: Sizes, takes_key: bool) -> Int[Array, ""]:
+        """So many evaluations make a round."""
+        usual = jnp.where(self.seen, sizes.later, sizes.first)
+        # those at once have the same random numbers: one center is enough
+        more = takes_key and sizes.step == 1
+        return jnp.where(self.circles(), _CENTERS * usual, usual) if more else usual
+
+    def places(
+        self, count: int, takes_key: bool
+    ) -> tuple[Bool[Array, " count"], Int[Array, " count"]]:
+        """Which of the next evaluations are at the center, and which samples the others are."""
+        at = self.taken + jnp.arange(count, dtype=jnp.int32)
+        if not takes_key:
+            return at == 0, at - 1
+        every = max(_CENTERS, count)
+        more = jnp.where(self.circles(), at // every, 0)
+        return (at == 0) | (self.circles() & (at % every == 0)), at - 1 - more
+
     def later_scale(self) -> Float[Array, " n"]:
         """How wide the samples are where the local model has failed since."""
         vain = (self.rounds > 0) & self.came_to_nothing()
@@ -129,11 +154,18 @@ class Wide(eqx.Module):
         center, here = here if takes_key else history.lowest(*here)
         u = (history.points - center[None]) / sigma[None]
         sides = sides_of(params, center, sigma)
-        move, error = gauss_newton_step(u, history.rows, history.valid, *sides)
+        fresh = history.valid & (jnp.arange(len(u)) >= len(u) - count)
+        known = u, history.rows, history.valid
+        if takes_key:
+            there = fresh & jnp.all(history.points == center[None], axis=1)
+            known = seen_from_center(*known, there & self.circles())
+        move, error = gauss_newton_step(*known, *sides)
+        if takes_key:
+            near = jnp.max(jnp.abs(move)) < 1
+            move = jnp.where(self.circles() & near, SHARE * move, move)
         length = jnp.abs(move) / LONGEST
         move = move / jnp.maximum(1, jnp.max(length))
         theta = params.clip(center + sigma * move)
-        fresh = history.valid & (jnp.arange(len(u)) >= len(u) - count)
         some = history.rows[jnp.argmax(fresh)]
         same = jnp.all(alike(history.rows, some) | ~fresh)
         # a few that are the same call for more of them first

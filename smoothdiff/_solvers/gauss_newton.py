@@ -69,7 +69,9 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     loss, if the samples are then below 0.3 sigma wide. Wider ones are to find the valley. A test
     has 4 (n + 1) steps at most. The local model stays if it lowers the logarithm of the loss at 0.3
     times the rate of the rounds before. Else the rounds go on where they were, and the next test
-    comes after twice as many evaluations. Where the function takes a key, there are no tests.
+    comes after twice as many evaluations. Where the function takes a key, there are no tests, and
+    after six rounds every second evaluation is at the center: what residuals are there is not the
+    mean over the samples where they are curved.
 
     Within finite bounds a search that would end with more than a tenth of the loss of its start
     looks at n + 1 points spread over all of the box, and at n that differ from the best one in one
