@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from smoothdiff._products import dot
 from smoothdiff._solvers._residual_batch import centred
+from smoothdiff._solvers._where import where
 
 # how strongly later centers count: as the power of their number
 _LATER = 3.0
@@ -79,8 +80,8 @@ def seen_from_center(
     The evaluations `there` are at the center. They count for that alone: otherwise their noise
     would be in the slopes too, and a product of the two is no zero in the mean.
     """
-    known, others = jnp.any(there), valid & ~there
+    others = valid & ~there
     count = jnp.maximum(jnp.sum(there), 1).astype(rows.dtype)
     here = dot(there.astype(rows.dtype), rows) / count
     moved = centred(u, others), here[None] + centred(rows, others), others
-    return tuple(jnp.where(known, a, b) for a, b in zip(moved, (u, rows, valid), strict=True))
+    return where(jnp.any(there), moved, (u, rows, valid))
