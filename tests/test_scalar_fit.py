@@ -189,6 +189,24 @@ def test_invalid_samples_do_not_count(nonsense, x64):
         np.testing.assert_allclose(more[name], less[name], err_msg=name, **close)
 
 
+@pytest.mark.parametrize("shift", [0.0, 30.0])
+def test_what_a_round_has_in_common_says_nothing(shift, known, x64):
+    value, smoothed, slope, _ = known
+    points, valid = samples(3, 40, np.float64)
+    rounds = np.arange(40) // 8
+    # a quadratic, and a number of each round
+    values = value(points) + shift * np.random.default_rng(2).normal(size=5)[rounds]
+    points, values, valid, rounds = map(jnp.asarray, (points, values, valid, rounds))
+    model = jax.jit(fit)(points, values, valid, rounds)
+    here = jnp.zeros(3)
+    np.testing.assert_allclose(model.grad(here), slope(np.zeros(3)), atol=0.02)
+    assert model.noise < 0.1
+    if not shift:
+        assert model.value(here) == pytest.approx(smoothed(np.zeros(3)), abs=0.02)
+    else:
+        assert jnp.linalg.norm(fit(points, values, valid).grad(here) - slope(np.zeros(3))) > 1
+
+
 @pytest.mark.parametrize("constant", [0.0, -7.25, 1e20])
 def test_constant_values_have_no_slope(constant, dtype):
     points, valid = samples(3, 20, dtype)

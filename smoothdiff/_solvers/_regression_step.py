@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
 from smoothdiff._solvers._averaging import apart
@@ -69,18 +69,19 @@ class Center(eqx.Module):
         returns: Bool[Array, ""],
         level: Bool[Array, ""],
         small: Callable[[Array], Array] = lambda move: jnp.asarray(False),
-        takes_key: bool = False,
+        rounds: Int[Array, " m"] | None = None,
     ) -> tuple["Center", Float[Array, ""], Float[Array, ""]]:
         """The next center; the smoothed function at this one, and its standard error.
 
         It `returns` to the lowest sample from a step that led nowhere, or not. `level` says whether
         the last samples all have one value, `small` whether a step is too small to lead anywhere.
-        Where the function `takes_key`, samples are no nearer to each other than noise allows.
+        Where the function takes a key, another one in each of the `rounds`, samples are no nearer
+        to each other than noise allows.
         """
         unit = _unit(values, valid)
         theta, metric, trust = self.theta, self.metric, self.trust.times(1 / unit)
         values = values / unit
-        model = fit(metric.into(points - theta[None]) / trust.width, values, valid)
+        model = fit(metric.into(points - theta[None]) / trust.width, values, valid, rounds)
         before = metric.into(self.accepted - theta) / trust.width
         good, ratio = outcome(model, before, trust.reduction)
         at, base = jnp.where(good, 0, before), jnp.where(good, theta, self.accepted)
@@ -107,7 +108,7 @@ class Center(eqx.Module):
         # an estimate below all samples is an error of the model
         value = jnp.maximum(model.value(here), known[lowest])
         new = revise(trust, step, good, ratio, value, small(x - base), level, adaptive)
-        if takes_key:
+        if rounds is not None:
             wide = jnp.maximum(new.width, apart(trust.width, model.noise, model.spread(here)))
             radius = new.radius * new.width / wide
             new = eqx.tree_at(lambda t: (t.width, t.radius), new, (wide, radius))

@@ -8,7 +8,8 @@ $$ k(u, v) = \frac{u \cdot v}{n} + a \left(\frac{u \cdot v}{n}\right)^2
 
 so that slopes, curvatures and what is neither have a share each. It is exact for a quadratic, needs
 no more samples than there are, and reads n numbers a sample: no n x n array appears. Smoothing with
-N(0, I) keeps every term in closed form, and so are the standard errors.
+N(0, I) keeps every term in closed form, and so are the standard errors. Where rounds of samples
+have random numbers of their own, a number that all of a round have in common may be noise.
 """
 
 from collections.abc import Callable
@@ -16,7 +17,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._products import dot
 
@@ -168,11 +169,15 @@ class ScalarFit(eqx.Module):
 
 
 def fit(
-    points: Float[Array, "m n"], values: Float[Array, " m"], valid: Bool[Array, " m"]
+    points: Float[Array, "m n"],
+    values: Float[Array, " m"],
+    valid: Bool[Array, " m"],
+    rounds: Int[Array, " m"] | None = None,
 ) -> ScalarFit:
     """The fit with the shares and the ridge that make the samples likeliest.
 
-    Samples that are not valid are left out; any values may stand there.
+    Samples that are not valid are left out; any values may stand there. Those of one of the
+    `rounds` have the same random numbers: what these add to all of them says nothing.
     """
     dtype = points.dtype
     spread = jnp.mean(points * points, axis=1)
@@ -198,7 +203,10 @@ def fit(
     radial = jnp.exp(-jnp.maximum(apart, 0) / 2)
     weights = closeness[:, None] * closeness[None]
     size = values.size
-    parts = jnp.stack([gram, gram**2, radial]) * weights[None]
+    kinds = [gram, gram**2, radial]
+    if rounds is not None:
+        kinds.append((rounds[:, None] == rounds[None]).astype(dtype))
+    parts = jnp.stack(kinds) * weights[None]
     parts = jnp.concatenate([parts, jnp.eye(size, dtype=dtype)[None]]).reshape(-1, size**2)
     sides = closeness[:, None] * jnp.stack([jnp.ones_like(targets), targets], axis=1)
 
@@ -212,11 +220,18 @@ def fit(
         left = values - constant * ones
         misfit = jnp.maximum(dot(left, left) / count, jnp.finfo(dtype).tiny)
         volume = jnp.sum(jnp.log(jnp.diagonal(factor)))
-        volume -= (size - count) / 2 * jnp.log(choice[2])
+        volume -= (size - count) / 2 * jnp.log(choice[-1])
         evidence = -(count - 1) / 2 * jnp.log(misfit) - volume - jnp.log(mass) / 2
         return evidence, left, constant, misfit, factor
 
-    choices = [(*shares, ridge) for ridge in _RIDGES[dtype.name] for shares in _SHARES]
+    # what a round has in common may be all of the variance, which is one, or nothing
+    common = ((),) if rounds is None else ((0.0,), (1.0,))
+    choices = [
+        (*shares, *offset, ridge)
+        for ridge in _RIDGES[dtype.name]
+        for offset in common
+        for shares in _SHARES
+    ]
     table = jnp.asarray(choices, dtype)
     # one after the other, as LAPACK takes them anyway: a vmap would hold all matrices at once
     evidence: Array = jax.lax.map(lambda choice: solve(choice)[0], table)
@@ -232,5 +247,5 @@ def fit(
         amplitude=scale * jnp.sqrt(misfit),
         closeness=closeness,
         factor=factor,
-        noise=scale * jnp.sqrt(misfit * choice[2]),
+        noise=scale * jnp.sqrt(misfit * choice[-1]),
     )
