@@ -145,13 +145,48 @@ def test_the_local_model_shares_its_numbers_and_rounds_have_others(residuals, ho
     assert not set(host.keys[-last:]) & set(keys)
     assert len(set(host.keys[-last:])) == 3
     each = last // 3
-    np.testing.assert_array_equal(host.points[-last : each - last], host.points[-each:])
+    answers, places = host.points[-last : each - last], host.points[:local]
+    np.testing.assert_array_equal(answers, host.points[-each:])
+    if not residuals:
+        # with the first key, which the first round has too
+        values = [float(host.one(place, np.array(keys[0], np.uint32))) for place in places]
+        ended = min(values[: local - 4])
+        assert float(host.one(answers[1], np.array(keys[0], np.uint32))) == pytest.approx(ended)
+
+
+@pytest.mark.slow
+def test_a_key_with_ripples_of_its_own_is_left():
+    keys = []
+
+    @sd.black_box
+    def rippled(y, bits):
+        keys.append(int(bits))
+        phase = np.random.default_rng(int(bits)).uniform(0, 6, 2)
+        return np.float32(np.sum(y**2) + 0.05 * np.sum(np.sin(40 * y + phase)))
+
+    fun = lambda y, args, key: rippled(y, jax.random.bits(key))
+    sd.minimise(fun, START, key=KEY, sigma=0.3, max_evaluations=120, takes_key=True)
+    # a turn of 12 (n + 1) evaluations after 2 n + 1 first points, and a first round; 60 without
+    assert keys.count(keys[0]) <= 5 + 36 + 5
+
+
+@pytest.mark.slow
+def test_several_can_be_asked_for_at_once():
+    search = sd.Search(START, key=KEY, residuals=True, sigma=0.3, takes_key=True)
+    told = jax.jit(lambda y, key: decay(y, DATA, key))
+    for _ in range(36):
+        points = search.ask(4)
+        search.tell(points, [told(jnp.asarray(point), search.key) for point in points])
+    # all rounds that were paid for have gone on
+    assert search._state.search.wide.rounds > 10
+    assert len(search._came) < 8
+    np.testing.assert_allclose(search.y, RATE, atol=0.1)
 
 
 @pytest.mark.slow
 def test_a_search_is_told_what_a_run_evaluates(host):
-    run = sd.least_squares(rows, START, key=KEY, sigma=0.3, max_steps=40, takes_key=True)
-    points, keys = host.points[:40], host.keys[:40]
+    run = sd.least_squares(rows, START, key=KEY, sigma=0.3, max_steps=100, takes_key=True)
+    points, keys = host.points[:100], host.keys[:100]
     search = sd.Search(START, key=KEY, residuals=True, sigma=0.3, takes_key=True)
     for point, key in zip(points, keys, strict=True):
         bits = jax.random.key_data(search.key)
@@ -358,12 +393,14 @@ def test_the_center_comes_every_second_time_after_the_first_rounds():
     sizes, at_once = Sizes.of(None, 6, 4, 50), Sizes.of(4, 8, 4, 50)
 
     def round_of(wide, sizes, takes_key):
-        centers, samples = [], []
+        near, samples, there = [], [], []
         for taken in range(0, int(wide.size(sizes, takes_key)), sizes.step):
-            at, which = eqx.tree_at(lambda w: w.taken, wide, taken).places(sizes.step, takes_key)
-            centers += at.tolist()
-            samples += which[~at].tolist()
-        return centers, samples
+            share, which = eqx.tree_at(lambda w: w.taken, wide, taken).places(sizes, takes_key)
+            near += (share < 0.1).tolist()
+            samples += which[share == 1].tolist()
+            there += which[(share > 0) & (share < 1)].tolist()
+        assert len(set(there)) == len(there)  # no two at one point
+        return near, samples
 
     first = [True] + [False] * 5, list(range(5))
     assert round_of(wide, sizes, True) == round_of(wide, sizes, False) == first

@@ -4,9 +4,9 @@ As long as its local model predicts, a search of a function that takes random nu
 same ones. Where the model ends, at a minimum of these numbers alone, rounds of samples with fresh
 ones follow, until the run ends. The more rounds, the nearer is the mean of their centers.
 
-After the first rounds residuals are evaluated at the center as often as around it. Those around it
-say how they change, those at the center what they are: the mean over samples is another where they
-are curved.
+After the first rounds residuals are evaluated next to the center as often as around it. Those
+around it say how they change, those near it what they are: the mean over samples is another where
+they are curved.
 """
 
 import equinox as eqx

@@ -38,7 +38,8 @@ class History(eqx.Module):
     """Evaluations from the oldest to the newest; at first all of them are empty, and not `valid`.
 
     A row holds what the function returned, residuals or one value, and `funs` what is minimised.
-    Where it had no value one may be `guessed`, see `barred`, which is valid to the models.
+    Where it had no value one may be `guessed`, see `barred`, which is valid to the models. What has
+    the same of the `numbers` was evaluated with the same key, if the function takes one.
     """
 
     points: Float[Array, "M n"]
@@ -46,6 +47,7 @@ class History(eqx.Module):
     funs: Float[Array, " M"]
     valid: Bool[Array, " M"]
     guessed: Bool[Array, " M"]
+    numbers: Int[Array, " M"]
 
     @staticmethod
     def of(
@@ -53,9 +55,11 @@ class History(eqx.Module):
         rows: Float[Array, "M P"],
         funs: Float[Array, " M"],
         valid: Bool[Array, " M"],
+        numbers: Int[Array, ""] | int = 0,
     ) -> "History":
-        """Of evaluations, none of them guessed."""
-        return History(points, rows, funs, valid, jnp.zeros(valid.shape, bool))
+        """Of evaluations, none of them guessed, all with these numbers."""
+        same = jnp.full(valid.shape, numbers, jnp.int32)
+        return History(points, rows, funs, valid, jnp.zeros(valid.shape, bool), same)
 
     @staticmethod
     def empty(length: int, n: int, size: int, dtype) -> "History":
@@ -132,7 +136,7 @@ class History(eqx.Module):
             rows = high
         rows = jnp.where(bars[:, None], rows, self.rows)
         funs = jnp.where(bars, high, self.funs)
-        return History(self.points, rows, funs, self.valid | bars, bars)
+        return History(self.points, rows, funs, self.valid | bars, bars, self.numbers)
 
     def evaluated(self) -> Bool[Array, " M"]:
         """Which of them are what the function returned."""

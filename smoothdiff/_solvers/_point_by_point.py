@@ -62,7 +62,10 @@ def patience(n: int, num_samples: int | None) -> int:
 
 
 def final_evaluations(candidates: int) -> int:
-    """The best point again, and so many candidates of the search; with noise the start as well."""
+    """The best point again, and so many candidates of the search; with noise the start as well.
+
+    With a key there are up to three candidates in three rounds, which are fewer.
+    """
     return judging(0, new=candidates, old=1)
 
 
@@ -221,7 +224,7 @@ class PointStep(eqx.Module):
         funs = objectives(rows, self.solver.squares)
         good = jnp.isfinite(funs)
         rows, funs = jnp.where(good[:, None], rows, 0), jnp.where(good, funs, 0)
-        return History.of(points, rows, funs, good)
+        return History.of(points, rows, funs, good, self.state.search.numbers())
 
     def step(self, evaluate: Evaluator) -> tuple[PyTree[Array], PointState, PyTree]:
         """The next evaluation, or as many as run at once."""

@@ -79,10 +79,11 @@ class ResidualSearch(ResidualState):
             return center[None] + sigma[None] * proposal.points, proposal
 
         def wide() -> tuple[Array, Proposal]:
-            wide, samples = self.wide, draw(max(sizes.first - 1, 1))
+            keyed = self.average is not None
+            wide, samples = self.wide, draw(sizes.first if keyed else max(sizes.first - 1, 1))
             width = sigma * wide.scale
-            at_center, index = wide.places(count, self.average is not None)
-            samples = samples[jnp.clip(index, 0, len(samples) - 1)]
+            share, index = wide.places(sizes, keyed)
+            samples = share[:, None] * samples[jnp.clip(index, 0, len(samples) - 1)]
             points = jax.vmap(params.reflected)(wide.center[None] + width[None] * samples)
             step, worth = further(wide.move, width)
             # at the bounds it may be one that is known
@@ -90,7 +91,7 @@ class ResidualSearch(ResidualState):
             same = jnp.all(self.history.points == end[None], axis=1) & self.history.valid
             worth &= ~jnp.any(same)
             points = jnp.where(((wide.taken + slot == 1) & worth)[:, None], end[None], points)
-            return jnp.where(at_center[:, None], wide.center[None], points), nothing
+            return jnp.where((share == 0)[:, None], wide.center[None], points), nothing
 
         pilot = lambda: (self.pilot.points(params, self.start, draw, count), nothing)
         branches = [first, local, wide, pilot]

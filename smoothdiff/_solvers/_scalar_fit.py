@@ -224,7 +224,7 @@ def fit(
         evidence = -(count - 1) / 2 * jnp.log(misfit) - volume - jnp.log(mass) / 2
         return evidence, left, constant, misfit, factor
 
-    # what a round has in common may be all of the variance, which is one, or nothing
+    # the variance of a round's common number: none, or as much as all values have
     common = ((),) if rounds is None else ((0.0,), (1.0,))
     choices = [
         (*shares, *offset, ridge)

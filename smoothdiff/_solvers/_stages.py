@@ -14,20 +14,22 @@ FIRST, TRUST, WIDE, PILOT, LOOK, SCAN = 0, 1, 2, 3, 4, 5
 class Sizes(NamedTuple):
     """Evaluations a step, and samples of a first wide round and of a later one.
 
-    After `patience` evaluations in a row that hardly lowered the function a search may end.
+    After `patience` evaluations in a row that hardly lowered the function a search may end. The run
+    makes so many evaluations `at_once`; a `Search` may be asked for other numbers of points.
     """
 
     step: int
     first: int
     later: int
     patience: int
+    at_once: int = 1
 
     @staticmethod
     def of(at_once: int | None, first: int, later: int, patience: int) -> "Sizes":
         """For so many evaluations at once, or one; rounds take as many steps as they need."""
         step = at_once or 1
         first, later = (-(-count // step) * step for count in (first, later))
-        return Sizes(step, first, later, patience)
+        return Sizes(step, first, later, patience, step)
 
 
 def by_stage(

@@ -33,6 +33,8 @@ from smoothdiff._solvers._where import where
 _LONG = 60
 # a turn of a local model that predicts is at most so many times as long
 _LONGER = 4
+# where it has a single one, it is so many times as long as a first one
+_ONE_TURN = 2
 # so many steps or evaluations that led nowhere are enough for any patience
 _ENOUGH = 2**24
 
@@ -161,9 +163,7 @@ class ValueSearch(ValueState):
         """The next center, from all samples."""
         history, average = self.history, self.average
         keyed, known = average is not None, (history.points, history.funs, history.valid)
-        # from the newest; what was before the first has numbers of its own
-        age = jnp.arange(len(history.valid), dtype=jnp.int32)[::-1] // sizes.first
-        rounds = jnp.minimum(age, self.rounds + 1) if keyed else None
+        rounds = history.numbers if keyed else None
         returns = ~self.patient(self.searches) & ~self.noisy & (not keyed)
         level = are_level(*self.last(sizes))
         center, *_ = self.center.stepped(params, *known, True, returns, level, rounds=rounds)
@@ -189,10 +189,14 @@ class ValueSearch(ValueState):
         point, _, fun = self.history.best(self.start)
         lower, little = turn.lowered(fun)
         stuck = local & self.trust.stuck()
-        # values with other keys are not to be compared, nor is how fast they fell: from the minimum
-        # of one key there is no way back, and no model that does not predict is worth a long one
-        long = turn.over() if self.average is None else local & (turn.spent >= 2 * turn.length)
-        ended = (long | stuck | (~local & self.center.lost(sizes))) & ~self.later()
+        # values with other keys are not to be compared, nor is how fast they fell: wide samples go
+        # on to the end, and the model of one key has one turn before them
+        one = local & (turn.spent >= _ONE_TURN * turn.length)
+        ended = (
+            (turn.over() if self.average is None else one)
+            | stuck
+            | (~local & self.center.lost(sizes))
+        ) & ~self.later()
         # a model that predicts goes on, but not in a test of it, nor for ever
         going = self.trust.predicts() & ~turn.test & (turn.spent < _LONGER * turn.length) & ~stuck
         # so does one about to converge, but not once it has: other searches may follow

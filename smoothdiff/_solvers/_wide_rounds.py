@@ -23,8 +23,11 @@ _NARROWEST = 0.1
 LONGEST = 2.0
 # a step is tried so many times as far, where that is at least sigma
 _FURTHER = 5.0
-# after so many rounds, of so many evaluations with random numbers of their own one is at the center
-_FIRST, _CENTERS = 6, 2
+# the first rounds of a function that takes a key
+_FIRST = 6
+# after them, of so many evaluations one is at the center: so much nearer than a sample, or at most
+# so far away in widths
+_CENTERS, _CLOSE, _THERE = 2, 0.05, 0.2
 # so many steps in a row that halve the loss, within the width, came true
 _TRUE = 2
 # rounds come to nothing after so many evaluations, for each parameter and one, that found no lower
@@ -81,27 +84,34 @@ class Wide(eqx.Module):
         narrow = jnp.sqrt(jnp.mean(self.scale**2)) < _NARROW
         return narrow & self.found & (self.true == 0)
 
-    def circles(self) -> Bool[Array, ""]:
+    def is_settling(self) -> Bool[Array, ""]:
         """Whether the first rounds are over, which may have far to go."""
         return self.rounds > _FIRST
 
     def size(self, sizes: Sizes, takes_key: bool) -> Int[Array, ""]:
         """So many evaluations make a round."""
         usual = jnp.where(self.seen, sizes.later, sizes.first)
-        # those at once have the same random numbers: one center is enough
-        more = takes_key and sizes.step == 1
-        return jnp.where(self.circles(), _CENTERS * usual, usual) if more else usual
+        # those at once have the same random numbers: one at the center is enough
+        more = takes_key and sizes.at_once == 1
+        return jnp.where(self.is_settling(), _CENTERS * usual, usual) if more else usual
 
     def places(
-        self, count: int, takes_key: bool
-    ) -> tuple[Bool[Array, " count"], Int[Array, " count"]]:
-        """Which of the next evaluations are at the center, and which samples the others are."""
-        at = self.taken + jnp.arange(count, dtype=jnp.int32)
+        self, sizes: Sizes, takes_key: bool
+    ) -> tuple[Float[Array, " count"], Int[Array, " count"]]:
+        """Which samples the next evaluations are, and how far away, as a share of that.
+
+        The first is the center. With a key there are others as good as there: a `Search` hands out
+        no point twice.
+        """
+        at = self.taken + jnp.arange(sizes.step, dtype=jnp.int32)
+        first = at == 0
         if not takes_key:
-            return at == 0, at - 1
-        every = max(_CENTERS, count)
-        more = jnp.where(self.circles(), at // every, 0)
-        return (at == 0) | (self.circles() & (at % every == 0)), at - 1 - more
+            return jnp.where(first, 0, jnp.ones_like(at, self.scale.dtype)), at - 1
+        every = max(_CENTERS, sizes.at_once)
+        there = self.is_settling() & (at % every == 0)
+        before = jnp.where(self.is_settling(), at // every, 0)
+        share = jnp.where(there, jnp.asarray(_CLOSE, self.scale.dtype), 1)
+        return jnp.where(first, 0, share), jnp.where(there, before, at - 1 - before)
 
     def later_scale(self) -> Float[Array, " n"]:
         """How wide the samples are where the local model has failed since."""
@@ -155,14 +165,14 @@ class Wide(eqx.Module):
         u = (history.points - center[None]) / sigma[None]
         sides = sides_of(params, center, sigma)
         fresh = history.valid & (jnp.arange(len(u)) >= len(u) - count)
-        known = u, history.rows, history.valid
+        known, there = (u, history.rows, history.valid), jnp.zeros_like(fresh)
         if takes_key:
-            there = fresh & jnp.all(history.points == center[None], axis=1)
-            known = seen_from_center(*known, there & self.circles())
+            there = fresh & self.is_settling() & (jnp.max(jnp.abs(u), axis=1) < _THERE)
+            known = seen_from_center(*known, there)
         move, error = gauss_newton_step(*known, *sides)
         if takes_key:
             near = jnp.max(jnp.abs(move)) < 1
-            move = jnp.where(self.circles() & near, SHARE * move, move)
+            move = jnp.where(self.is_settling() & near, SHARE * move, move)
         length = jnp.abs(move) / LONGEST
         move = move / jnp.maximum(1, jnp.max(length))
         theta = params.clip(center + sigma * move)
@@ -177,7 +187,7 @@ class Wide(eqx.Module):
             least = apart(self.scale, *_noise_and_signal(u, history.rows, history.valid))
             scale = jnp.where(flat, scale, jnp.maximum(scale, least))
         # where most samples gave no numbers they were too far away
-        few = 2 * jnp.sum(fresh) < count
+        few = 2 * jnp.sum(fresh & ~there) < count - jnp.sum(there)
         scale = jnp.where(few, self.scale / 2, scale)
         finite = jnp.all(jnp.isfinite(theta)) & jnp.all(jnp.isfinite(scale))
         return Wide(

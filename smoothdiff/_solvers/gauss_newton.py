@@ -69,9 +69,10 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     loss, if the samples are then below 0.3 sigma wide. Wider ones are to find the valley. A test
     has 4 (n + 1) steps at most. The local model stays if it lowers the logarithm of the loss at 0.3
     times the rate of the rounds before. Else the rounds go on where they were, and the next test
-    comes after twice as many evaluations. Where the function takes a key, there are no tests, and
-    after six rounds every second evaluation is at the center: what residuals are there is not the
-    mean over the samples where they are curved.
+    comes after twice as many evaluations. Where the function takes a key, there are no tests. After
+    six rounds every second evaluation, or one of `num_samples`, is next to the center: what
+    residuals are there is not the mean over samples where they are curved. Steps shorter than the
+    width are then halved.
 
     Within finite bounds a search that would end with more than a tenth of the loss of its start
     looks at n + 1 points spread over all of the box, and at n that differ from the best one in one
@@ -229,7 +230,8 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         theta = smoothed_params(self, y, jnp.asarray(0, jnp.int32), options).theta
         n = theta.size
         usual = max(min(max(12 * n, 32), 256), 3 * sizes.first, 2 * n)
-        length = max(self.history or usual, sizes.first, n + 2)
+        # a round, its evaluations at the center included
+        length = max(self.history or usual, 2 * sizes.first, n + 2)
         search = ResidualSearch.of(theta, History.empty(length, n, size, theta.dtype))
         return _point_by_point.init(self, y, search, options, aux_struct)
 

@@ -68,8 +68,9 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     M, the metric of both, takes the shape of the Hessian, directions included up to 64 parameters.
     So sigma says where to begin.
 
-    Where the function takes a key, the local model has one turn, twice as long. The wide one takes
-    what all samples of a round have in common as noise, if that is likelier.
+    Where the function takes a key, the local model has one turn, of 12 (n + 1) evaluations, or 24
+    (n + 1) while it predicts. The wide one takes what all samples of a round have in common as
+    noise, if that is likelier.
 
     With 100 parameters and more, or with an optax schedule of sigma, each step takes a batch, and
     the wide model alone.
