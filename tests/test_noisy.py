@@ -178,7 +178,7 @@ def test_several_can_be_asked_for_at_once():
         points = search.ask(4)
         search.tell(points, [told(jnp.asarray(point), search.key) for point in points])
     # all rounds that were paid for have gone on
-    assert search._state.search.wide.rounds > 10
+    assert search._state.search.round() > 10
     assert len(search._came) < 8
     np.testing.assert_allclose(search.y, RATE, atol=0.1)
 
