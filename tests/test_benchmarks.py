@@ -441,3 +441,16 @@ def test_figures_have_few_colours(tmp_path):
     with Image.open(path) as picture:
         assert picture.mode == "P"
         assert picture.size == (450, 300)
+
+
+def test_a_rare_colour_is_kept(tmp_path):
+    """As that of a method's name beside pictures that have many others."""
+    random = np.random.default_rng(0)
+    browns = np.array([120, 100, 80]) + random.integers(-60, 60, (300, 300, 3))
+    browns[:4, :4], browns[-4:, -4:] = (31, 119, 180), (23, 155, 91)
+    Image.fromarray(browns.astype(np.uint8)).save(tmp_path / "film.png")
+    _style.in_few_colours(tmp_path / "film.png")
+    with Image.open(tmp_path / "film.png") as picture:
+        few = np.asarray(picture.convert("RGB")).astype(int)
+    assert np.max(np.abs(few - browns)[:4, :4]) < 20
+    assert np.max(np.abs(few - browns)[-4:, -4:]) < 20

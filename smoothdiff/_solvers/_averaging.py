@@ -1,12 +1,12 @@
 """What a search makes of noise: a mean of its centers, and samples far enough apart.
 
-As long as its local model predicts, a search of a function that takes random numbers gives it the
-same ones. Where the model ends, at a minimum of these numbers alone, rounds of samples with fresh
-ones follow, until the run ends. The more rounds, the nearer is the mean of their centers.
+A search gives a function that takes random numbers the same ones while its local model lasts. That
+ends at a minimum of these numbers alone, or after one turn. Rounds of samples with fresh ones
+follow, until the run ends. The more rounds, the nearer is the mean of their centers.
 
-After the first rounds residuals are evaluated next to the center as often as around it. Those
-around it say how they change, those near it what they are: the mean over samples is another where
-they are curved.
+After the first rounds residuals are evaluated next to the center as often as around it. Samples
+around it say how residuals change, those next to it what they are there. Where residuals are
+curved, the mean over the samples around it is something else.
 """
 
 import equinox as eqx

@@ -189,14 +189,12 @@ class ValueSearch(ValueState):
         point, _, fun = self.history.best(self.start)
         lower, little = turn.lowered(fun)
         stuck = local & self.trust.stuck()
-        # values with other keys are not to be compared, nor is how fast they fell: wide samples go
-        # on to the end, and the model of one key has one turn before them
-        one = local & (turn.spent >= _ONE_TURN * turn.length)
-        ended = (
-            (turn.over() if self.average is None else one)
-            | stuck
-            | (~local & self.center.lost(sizes))
-        ) & ~self.later()
+        over = turn.over()
+        if self.average is not None:
+            # values with other keys are not to be compared, nor is how fast they fell: wide samples
+            # go on to the end, and the model of one key has one turn before them
+            over = local & (turn.spent >= _ONE_TURN * turn.length)
+        ended = (over | stuck | (~local & self.center.lost(sizes))) & ~self.later()
         # a model that predicts goes on, but not in a test of it, nor for ever
         going = self.trust.predicts() & ~turn.test & (turn.spent < _LONGER * turn.length) & ~stuck
         # so does one about to converge, but not once it has: other searches may follow

@@ -23,11 +23,11 @@ _NARROWEST = 0.1
 LONGEST = 2.0
 # a step is tried so many times as far, where that is at least sigma
 _FURTHER = 5.0
-# the first rounds of a function that takes a key
-_FIRST = 6
-# after them, of so many evaluations one is at the center: so much nearer than a sample, or at most
-# so far away in widths
-_CENTERS, _CLOSE, _THERE = 2, 0.05, 0.2
+# a function that takes a key has so many first rounds; then one of so many evaluations is next to
+# the center
+_FIRST, _CENTERS = 6, 2
+# that is a sample at this share of its distance, and all that is nearer than so many widths
+_CLOSE, _THERE = 0.05, 0.2
 # so many steps in a row that halve the loss, within the width, came true
 _TRUE = 2
 # rounds come to nothing after so many evaluations, for each parameter and one, that found no lower
