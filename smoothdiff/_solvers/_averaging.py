@@ -75,13 +75,14 @@ def seen_from_center(
     valid: Bool[Array, " M"],
     there: Bool[Array, " M"],
 ) -> tuple[Float[Array, "M n"], Float[Array, "M P"], Bool[Array, " M"]]:
-    """Points and residuals around their means, the residuals on top of those at the center.
+    """Points and residuals moved, so that their means are those of the evaluations at the center.
 
-    The evaluations `there` are at the center. They count for that alone: otherwise their noise
-    would be in the slopes too, and a product of the two is no zero in the mean.
+    These are the ones that are `there`, or next to it. They count for that alone: otherwise their
+    noise would be in the slopes too, and a product of the two is no zero in the mean.
     """
     others = valid & ~there
-    count = jnp.maximum(jnp.sum(there), 1).astype(rows.dtype)
-    here = dot(there.astype(rows.dtype), rows) / count
-    moved = centred(u, others), here[None] + centred(rows, others), others
+    count = jnp.maximum(jnp.sum(there), 1)
+    share = there.astype(rows.dtype) / count.astype(rows.dtype)
+    at, here = dot(share, u), dot(share, rows)
+    moved = at[None] + centred(u, others), here[None] + centred(rows, others), others
     return where(jnp.any(there), moved, (u, rows, valid))

@@ -27,7 +27,7 @@ _FURTHER = 5.0
 # the center
 _FIRST, _CENTERS = 6, 2
 # that is a sample at this share of its distance, and all that is nearer than so many widths
-_CLOSE, _THERE = 0.05, 0.2
+_CLOSE, _THERE = 0.005, 0.02
 # so many steps in a row that halve the loss, within the width, came true
 _TRUE = 2
 # rounds come to nothing after so many evaluations, for each parameter and one, that found no lower
