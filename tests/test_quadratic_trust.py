@@ -13,6 +13,7 @@ from smoothdiff._params import take_apart
 from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._least_change import least_change
+from smoothdiff._solvers._model_check import apart
 from smoothdiff._solvers._quadratic_trust import QuadraticTrust
 
 N = 3
@@ -284,3 +285,9 @@ def test_points_that_do_not_determine_a_quadratic_are_not_met_exactly(x64):
     kink = lambda x: bowl(x) + 10 * np.maximum(x[0] - 0.5, 0)
     hessians = [np.asarray(proposal_of(known(around(count), kink))[1].hessian) for count in (9, 10)]
     assert np.linalg.norm(hessians[0] - HESSIAN) < np.linalg.norm(hessians[1] - HESSIAN)
+
+
+def test_a_check_is_at_no_known_point():
+    known = jnp.asarray([[0.0, 0.0], [1.0, 0.05], [0.5, 0.0]])
+    np.testing.assert_array_equal(apart(jnp.asarray([1.0, 0.0]), known), [0.25, 0.0])
+    np.testing.assert_array_equal(apart(jnp.asarray([0.0, 1.0]), known), [0.0, 1.0])

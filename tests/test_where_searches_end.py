@@ -266,3 +266,17 @@ def test_so_many_evaluations_at_once_end_a_search_after_a_few_steps():
     assert result.reason in ("converged", "stalled")
     assert result.fun == 1
     assert 5 <= len(result.history) < 20
+
+
+@pytest.mark.parametrize("n", [1, 2, 4])
+@pytest.mark.parametrize("at", [0.0, 1.0])
+def test_a_start_on_a_bound_is_not_taken_for_a_minimum_nearby(n, at):
+    away = lambda y, c: jnp.abs(y - at) - c
+    bowl = lambda y, c: jnp.sum(away(y, c) ** 2)
+    roof = lambda y, c: 1 + jnp.sum(jnp.abs(away(y, c)))
+    for fun in (bowl, roof):
+        for c in (0.02, 0.05, 0.09, 0.4):
+            start, least = np.full(n, at, np.float32), np.float32(c)
+            result = sd.minimise(fun, start, least, key=KEY, bounds=(0.0, 1.0), max_evaluations=400)
+            high, low = fun(start, least), fun(start + (1 - 2 * at) * least, least)
+            assert float((result.fun - low) / (high - low)) < 1e-3, (fun, c)

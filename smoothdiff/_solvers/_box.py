@@ -60,6 +60,19 @@ def over_box(
     return jnp.where(closed(params), low[None] + share * (high - low)[None], otherwise)
 
 
+def turned_inside(
+    params: Params, start: Float[Array, " n"], steps: Float[Array, "K n"]
+) -> Float[Array, "K n"]:
+    """The ends of steps from there, or half of the opposite one where a bound cuts off most of it.
+
+    Half, so that a step and its opposite still end at two points.
+    """
+    ends, opposite = (jax.vmap(params.clip)(start[None] + s) for s in (steps, -steps))
+    room, beyond = (jnp.abs(end - start[None]) for end in (ends, opposite))
+    cut = (room < jnp.abs(steps) / 2) & (room < beyond)
+    return jnp.where(cut, (start[None] + opposite) / 2, ends)
+
+
 def anywhere(params: Params, key: Array, lowest: Float[Array, " n"]) -> Float[Array, " n"]:
     """A point within the bounds; without them, around the lowest so far at a random width."""
     key, other = jax.random.split(key)

@@ -22,6 +22,9 @@ from smoothdiff._solvers._ratio_test import TELLING
 _STEPS = 10.0
 # a rise that is so many times higher or lower than predicted is right
 _RIGHT = 2.0
+# a point that is nearer to a known one than this share of its way is the same, and half the way is
+# tried, so often
+_KNOWN, _HALVES = 0.1, 4
 
 
 def check_step(
@@ -60,6 +63,19 @@ def check_step(
     direction = jnp.linalg.eigh(flat + dot(told.T, told))[1][:, 0]
     curvature = dot(direction, dot(model.hessian, direction))
     return jnp.minimum(jnp.maximum(length, far_enough(curvature)), radius) * direction
+
+
+def apart(step: Float[Array, " n"], known: Float[Array, "m n"]) -> Float[Array, " n"]:
+    """So much of a step that its end is at no known point: of these any model is right.
+
+    Args:
+        step: from the center to the check.
+        known: the points, seen from there.
+    """
+    ends = step[None] * 2.0 ** -jnp.arange(_HALVES, dtype=step.dtype)[:, None]
+    gaps = jnp.min(jnp.linalg.norm(ends[:, None] - known[None], axis=2), axis=1)
+    new = gaps > _KNOWN * jnp.linalg.norm(ends, axis=1)
+    return ends[jnp.argmax(new)]
 
 
 def is_right(

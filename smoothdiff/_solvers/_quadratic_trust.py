@@ -25,7 +25,7 @@ from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._least_change import least_change
 from smoothdiff._solvers._metric import Metric
-from smoothdiff._solvers._model_check import check_step, is_right
+from smoothdiff._solvers._model_check import apart, check_step, is_right
 from smoothdiff._solvers._point_search import nothing
 from smoothdiff._solvers._ratio_test import (
     FEW,
@@ -197,7 +197,8 @@ class QuadraticTrust(eqx.Module):
             ends = inside(ends)
             length = jnp.linalg.norm(ends, axis=1)
             short = length < jnp.max(length) / 2
-            return ends[jnp.argmin(jnp.where(short, jnp.inf, change(ends, grad, hessian)))]
+            lower = ends[jnp.argmin(jnp.where(short, jnp.inf, change(ends, grad, hessian)))]
+            return apart(lower, model.away)
 
         which = jnp.where(check, 2, self.improve.astype(jnp.int32))
         first = jax.lax.switch(which, [lambda: steps[0], other, checked])

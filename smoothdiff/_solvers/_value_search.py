@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from smoothdiff._params import Params
 from smoothdiff._solvers._base import all_finite
-from smoothdiff._solvers._box import bounded, bounds_of
+from smoothdiff._solvers._box import bounded, bounds_of, turned_inside
 from smoothdiff._solvers._fall import Fall, much
 from smoothdiff._solvers._first_points import CARRIED, NEARER, FirstPoints, others_nearer
 from smoothdiff._solvers._history import History
@@ -59,7 +59,7 @@ class ValueSearch(ValueState):
             sides = jnp.stack([unit, -unit], axis=1).reshape(SIDES * n, n)
             points = self.first.points(sides, lambda: draw(count), count)
             far = self.near * self.width() * params.sigma
-            return self.start[None] + far[None] * points, nothing
+            return turned_inside(params, self.start, far[None] * points), nothing
 
         def local() -> tuple[Array, Proposal]:
             center, _, fun = self.history.best(self.start)

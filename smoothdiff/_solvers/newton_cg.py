@@ -35,20 +35,22 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     $$ \min_p \; g \cdot p + \tfrac12 p \cdot H p, \qquad \|p\|_{M^{-1}} \le \Delta $$
 
     With fewer than 100 parameters the function is evaluated point by point. The first points are
-    the start, and one sigma from it to both sides along each parameter. Where both are higher than
-    the start, and the parabola through all three is lowest within a quarter of sigma, those along
-    the parameters that follow come nearer, too: to 0.03 sigma at most. Where all hardly differ,
-    pairs of points follow, each four times as far away, up to a thousand sigma, or within finite
-    bounds points anywhere, and then the first points again if these found a change. Then two models
-    take turns, and the one that lowers the function faster goes on. The local one begins, and goes
-    on while half of its steps lower the function, up to four times as long:
+    the start, and one sigma from it to both sides along each parameter, or to one side one and half
+    a sigma where a bound cuts off most of the other. Where both are higher than the start, and the
+    parabola through all three is lowest within a quarter of sigma, those along the parameters that
+    follow come nearer, too: to 0.03 sigma at most. Where all hardly differ, pairs of points follow,
+    each four times as far away, up to a thousand sigma, or within finite bounds points anywhere,
+    and then the first points again if these found a change. Then two models take turns, and the one
+    that lowers the function faster goes on. The local one begins, and goes on while half of its
+    steps lower the function, up to four times as long:
 
     - a local one, around the best point. It interpolates the nearest evaluations, and its Hessian
       differs least from the last one. While they do not determine it, and where they say clearly
       that the function is no quadratic, the farther ones count less. The step that minimises it
       within the trust region is one evaluation; the radius $\Delta$ grows where the function falls
       as predicted and shrinks where it does not. After a short step one evaluation checks the
-      model: a little farther away, in a flat direction that no other point tells of.
+      model: a little farther away, in a flat direction that no other point tells of, and at none
+      that is known.
     - a wide one, for functions that jump, have noise or many minima: a regression over samples
       around a center, which gives the smoothed value, gradient and Hessian-vector products in
       closed form, with standard errors. A truncated conjugate-gradient method minimises it. What is
