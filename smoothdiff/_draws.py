@@ -63,6 +63,10 @@ class Draws(eqx.Module):
         self.sampler = sampler
         self.key_data = jax.random.key_data(key)
         self.impl = str(jax.random.key_impl(key))
+        if self.impl in ("rbg", "unsafe_rbg"):
+            # under vmap the first row's key would draw for all rows, and a chunk has another first
+            # row; either half of such a key is a key of threefry
+            self.key_data, self.impl = self.key_data[:2], "threefry2x32"
         self.num, self.n, self.dtype = num, n, jnp.dtype(dtype)
         # whole blocks only, and at least one
         chunk = num if batch_size is None else max(block, batch_size // block * block)
