@@ -1,5 +1,6 @@
 """The points of one estimate as a pytree: kept in memory, or drawn again chunk by chunk."""
 
+import math
 from collections.abc import Callable
 
 import equinox as eqx
@@ -97,7 +98,7 @@ class Draws(eqx.Module):
             return fun(*self.kept)
         starts, _, _ = self._chunks(())
         out = jax.lax.map(lambda start: fun(*self._draw(start, self.chunk)), starts)
-        out = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), out)
+        out = jax.tree.map(lambda a: a.reshape(math.prod(a.shape[:2]), *a.shape[2:]), out)
         rest = self.num % self.chunk
         if rest:
             last = fun(*self._draw(self.num - rest, rest))

@@ -162,6 +162,11 @@ OUTPUTS = {
     "integer": (grad(fun=lambda x: 1), TypeError, r"int32.*astype\(float\)"),
     "boolean": (grad(fun=lambda x: x[0] > 0), TypeError, r"bool.*astype\(float\)"),
     "complex": (grad(fun=lambda x: x[0].astype(jnp.complex64)), TypeError, "complex64.*real"),
+    "nothing": (
+        lambda: sd.smooth(lambda x: {}, 0.5)(KEY, X),
+        TypeError,
+        "returned {}.*return what is to be smoothed",
+    ),
     "no pair for has_aux": (grad(has_aux=True), (TypeError, ValueError), "has_aux"),
 }
 VECTORS = {
