@@ -102,6 +102,11 @@ def hvp_stderr(
 @eqx.filter_jit
 def free_grad_stderr(batch: Batch, per_row: Array) -> tuple[Array, Array]:
     """Sum and standard error of a derivative by AD that is given in parts, one for each sample."""
+    if jnp.iscomplexobj(per_row):
+        # both parts have an error of their own
+        parts = free_grad_stderr(batch, jnp.stack([per_row.real, per_row.imag], axis=1))
+        mean, error = (jax.lax.complex(part[0], part[1]) for part in parts)
+        return mean, error
     flat = per_row.reshape(len(per_row), -1)
     mean = jnp.sum(flat, axis=0)
     rows = flat / batch.scale.astype(flat.dtype)
