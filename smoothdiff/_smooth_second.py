@@ -123,7 +123,9 @@ def smooth_hvp(
     Returns:
         `g(key, x, v, *other_args)` with `x, *other_args` the arguments of `fun` and `v` a vector
         with the structure of the arguments that `argnums` names: the product, like `v`; with
-        `has_aux` and `stderr=True` as `smooth`.
+        `has_aux` and `stderr=True` as `smooth`. With a `batch_size` it is compiled once, as by
+        `jax.jit`: what may change from call to call is an argument of `fun`. Of what `fun` only
+        refers to, it keeps the values of the first call.
 
     Raises:
         ValueError, TypeError: as `smooth`; an output that is no scalar; a `v` of another structure
