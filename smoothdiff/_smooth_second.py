@@ -65,6 +65,7 @@ def smooth_hessian(
 
     def g(key: Any, *args: Any) -> PyTree:
         params = call.params(key, args)
+        params.check_free()
         if not call.stderr:
             fun = partial(call.smoothed, scalar=True)
             hessian = jax.hessian(fun, call.shifted_argnums(len(args)), has_aux=True)
@@ -145,6 +146,7 @@ def smooth_hvp(
     def product(key: Any, x: PyTree, v: PyTree, *other_args: Any) -> PyTree:
         args = (x, *other_args)
         params = call.params(key, args)
+        params.check_free()
         params.layout.check_vector(v)
         if not call.stderr:
 

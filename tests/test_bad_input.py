@@ -239,6 +239,13 @@ def test_a_scalar_is_asked_for_where_one_is_needed(transform, fun):
         transform(fun, 0.5)(KEY, X)
 
 
+@pytest.mark.parametrize("transform", [sd.smooth_grad, sd.smooth_jacobian, sd.smooth_hessian])
+def test_integers_that_are_not_smoothed_have_no_derivative(transform):
+    p = {"a": X, "b": jnp.array(1)}
+    with pytest.raises(TypeError, match=r"int32 has no derivative: make it another argument"):
+        transform(tree_fun, NONE)(KEY, p)
+
+
 def test_the_same_messages_from_every_transform():
     """Checked before AD hides the values."""
     for transform in (sd.smooth, sd.smooth_jacobian, *SCALAR):
