@@ -151,7 +151,7 @@ class Importance(eqx.Module):
         call.only_smoothed(params, "Importance")
         if self.blur == "own":
             params = replace(params, theta=_fixed(params.theta), sigma=_fixed(params.sigma))
-        n, tree = params.theta.size, params.layout.tree
+        n, layout = params.theta.size, params.layout
         order, sampler = self.order, partial(ElementSampler, **vars(self))
         shift, ratio = displacement(params)
 
@@ -168,11 +168,12 @@ class Importance(eqx.Module):
         keys = jax.vmap(lambda e: jax.random.fold_in(as_first_key(key), e))(jnp.arange(len(pairs)))
         out = jax.lax.map(element, (jnp.asarray(pairs), keys)).astype(params.theta.dtype)
         if order == 1:
-            return tree(out / params.sigma)
+            return layout.tree(out / params.sigma)
         i, j = pairs.T
         out = out / (params.sigma[i] * params.sigma[j])
         matrix = jnp.zeros((n, n), out.dtype).at[i, j].set(out).at[j, i].set(out)
-        return jax.tree.map(lambda column: tree(jnp.moveaxis(column, 0, -1)), tree(matrix))
+        rows = layout.tree(matrix)
+        return jax.tree.map(lambda row: layout.alike(jnp.moveaxis(row, 0, -1)), rows)
 
 
 @jax.custom_jvp

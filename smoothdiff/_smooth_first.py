@@ -234,8 +234,7 @@ def smooth_jacobian(
 
         def per_parameter(leaf: Array) -> PyTree:
             sigma = jnp.broadcast_to(params.sigma, leaf.shape)
-            tree = params.layout.tree(leaf.astype(sigma.dtype) / sigma)
-            return jax.tree.map(lambda j: j.astype(leaf.dtype), tree)
+            return params.layout.alike((leaf.astype(sigma.dtype) / sigma).astype(leaf.dtype))
 
         estimate = jax.tree.map(per_parameter, jacobian)
         error = jax.tree.map(per_parameter, error)

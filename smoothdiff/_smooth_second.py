@@ -83,7 +83,7 @@ def smooth_hessian(
         columns = jax.lax.map(column, jnp.arange(params.theta.size))
         # the Hessian is symmetric: what lax.map stacked in front becomes the last axes
         estimate, error = (
-            jax.tree.map(lambda c: params.layout.tree(jnp.moveaxis(c, 0, -1)), tree)
+            jax.tree.map(lambda c: params.layout.alike(jnp.moveaxis(c, 0, -1)), tree)
             for tree in columns
         )
         return call.out(estimate, batch.aux, error)

@@ -77,6 +77,27 @@ def test_leaves_keep_their_own_dtype(key, x64):
     assert all(leaf.dtype == jnp.float64 for leaf in like_out)
 
 
+def test_a_hessian_with_errors_has_the_dtypes_of_one_without(key, x64):
+    """A block has that of its rows, and loses no digits to a narrower one of its columns."""
+    p = {"wide": jnp.ones(2, jnp.float64), "narrow": jnp.ones(3, jnp.float32)}
+    fun = lambda p: jnp.sum(p["wide"]) ** 2 * jnp.sum(p["narrow"]).astype(jnp.float64)
+
+    @jax.jit
+    def run():
+        plain = sd.smooth_hessian(fun, 0.5, **PLAIN)(key, p)
+        by_element = sd.Importance(2)(fun, 0.5, num_samples=2)(key, p)
+        return plain, by_element, *sd.smooth_hessian(fun, 0.5, **PLAIN, stderr=True)(key, p)
+
+    dtypes = lambda tree: jax.tree.map(lambda leaf: leaf.dtype, tree)
+    with jax.numpy_dtype_promotion("standard"):  # which jax.hessian needs for two dtypes
+        plain, *others = run()
+    for other in others:
+        assert dtypes(other) == dtypes(plain)
+    for other in others:
+        block = np.asarray(other["wide"]["narrow"])
+        assert np.any(block != block.astype(np.float32))
+
+
 @pytest.mark.parametrize("baseline", ["auto", "mean", "linear"])
 @pytest.mark.parametrize("batch_size", [None, 8])
 def test_leaves_without_a_number_stay_so(baseline, batch_size, key):
