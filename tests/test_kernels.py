@@ -123,7 +123,7 @@ def test_the_tails_are_finite_and_right(order, dtype):
 def test_the_inverse_is_right_at_the_smallest_probabilities(order, dtype):
     u = jnp.asarray([1e-37, 1e-30, 1e-20], dtype)
     want = [
-        -SIGMA * optimize.brentq(lambda t, p=p: np.log(tail(t, order) / p), 0, 30)  # pyright: ignore
+        -SIGMA * optimize.brentq(lambda t, p=p: np.log(tail(t, order) / p), 0, 30, xtol=1e-14)  # pyright: ignore
         for p in np.asarray(u, float)
     ]
     eps = float(jnp.finfo(dtype).eps)
