@@ -142,6 +142,11 @@ def _finite(values: Array) -> Array:
 
 
 def _check_values(values: PyTree) -> None:
+    if not jax.tree.leaves(values):
+        raise TypeError(
+            f"the function returned {values}, in which there is no array: return what is to be "
+            "smoothed"
+        )
     for leaf in jax.tree.leaves(values):
         if not jnp.issubdtype(leaf.dtype, jnp.floating):
             raise TypeError(

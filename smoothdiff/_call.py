@@ -66,8 +66,8 @@ class Options(TypedDict, total=False):
         nonfinite: "propagate" a NaN or infinite sample into the estimate, or "drop" it and
             re-weight the others; NaN if fewer than half are left.
         has_aux: the function returns (value, aux); aux comes back with one row per sample.
-        stderr: also return the standard error of the estimate. Do not differentiate what a
-            transform returns then: derivatives are lost, silently.
+        stderr: also return the standard error of the estimate, of a complex one that of each part.
+            Do not differentiate what a transform returns then: derivatives are lost, silently.
 
     Example:
         >>> import jax, jax.numpy as jnp, smoothdiff as sd

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from smoothdiff._numbers import inexact
+from smoothdiff._numbers import check_whole, inexact
 from smoothdiff._params import Params, as_key, take_apart
 
 # a gradient that is known to this share of its largest entry is known well enough; where it nearly
@@ -144,6 +144,7 @@ def check_gradient(
     """
     if not 0 < level < 1:
         raise ValueError(f"level={level} must be between 0 and 1, such as 0.05")
+    check_whole(num_samples, "num_samples")
     pairs = num_samples // 2
     if num_samples < _FEWEST:
         raise ValueError(f"num_samples={num_samples} are too few: take {_FEWEST} or more")

@@ -43,7 +43,7 @@ class Columns:
         parts = jnp.split(columns, self._ends[:-1], axis=1)
         return self._tree.unflatten(
             [
-                change(part.astype(v.dtype), level).reshape(-1, *v.shape[1:])
+                change(part.astype(v.dtype), level).reshape(len(columns), *v.shape[1:])
                 for part, level, v in zip(parts, self._levels, self._leaves, strict=True)
             ]
         )

@@ -10,6 +10,7 @@ from jaxtyping import PyTree
 from smoothdiff._call import Options
 from smoothdiff._params import as_first_key
 from smoothdiff._samplers import Sobol
+from smoothdiff._smooth_second import smooth_quadratic
 
 # as many as cost little beside one picture; in replicates, so that fits to them leave one out
 _SURROGATE: Options = {"num_samples": 4096, "sampler": Sobol(replicates=8), "baseline": "mean"}
@@ -49,7 +50,8 @@ def control_variate(
         A function that is called like the one that `transform(fun, sigma, **options)` returns.
 
     Raises:
-        ValueError, TypeError: as the transform; `has_aux=True`, which a surrogate cannot give.
+        ValueError, TypeError: as the transform; `has_aux=True`, which a surrogate cannot give;
+            `smooth_quadratic`.
 
     Example:
         >>> import jax, jax.numpy as jnp, smoothdiff as sd
@@ -62,6 +64,11 @@ def control_variate(
     Source: own; control variates whose mean is estimated, as in multilevel Monte Carlo (Giles,
     2008). ZeroGrads (Fischer and Ritschel) only descends on its surrogate.
     """
+    if transform is smooth_quadratic:
+        raise ValueError(
+            "two quadratic models have no sum that is one: use smooth_value_and_grad, smooth_hvp "
+            "or smooth_hessian"
+        )
     if options.get("has_aux", False):
         raise ValueError("a surrogate has no aux: use has_aux=False, or the transform by itself")
 

@@ -1,5 +1,6 @@
 """The points of one estimate as a pytree: kept in memory, or drawn again chunk by chunk."""
 
+import math
 from collections.abc import Callable
 
 import equinox as eqx
@@ -63,6 +64,10 @@ class Draws(eqx.Module):
         self.sampler = sampler
         self.key_data = jax.random.key_data(key)
         self.impl = str(jax.random.key_impl(key))
+        if self.impl in ("rbg", "unsafe_rbg"):
+            # under vmap the first row's key would draw for all rows, and a chunk has another first
+            # row; either half of such a key is a key of threefry
+            self.key_data, self.impl = self.key_data[:2], "threefry2x32"
         self.num, self.n, self.dtype = num, n, jnp.dtype(dtype)
         # whole blocks only, and at least one
         chunk = num if batch_size is None else max(block, batch_size // block * block)
@@ -93,7 +98,7 @@ class Draws(eqx.Module):
             return fun(*self.kept)
         starts, _, _ = self._chunks(())
         out = jax.lax.map(lambda start: fun(*self._draw(start, self.chunk)), starts)
-        out = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), out)
+        out = jax.tree.map(lambda a: a.reshape(math.prod(a.shape[:2]), *a.shape[2:]), out)
         rest = self.num % self.chunk
         if rest:
             last = fun(*self._draw(self.num - rest, rest))

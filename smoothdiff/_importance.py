@@ -21,7 +21,7 @@ from jaxtyping import Array, Int, PyTree
 from smoothdiff import kernels
 from smoothdiff._baselines import AbstractBaseline, Mean
 from smoothdiff._call import Call
-from smoothdiff._estimate import objective
+from smoothdiff._estimate import displacement, objective
 from smoothdiff._named_baselines import Auto, as_baseline
 from smoothdiff._params import as_first_key
 from smoothdiff._samplers import PointSampler
@@ -67,15 +67,20 @@ class Importance(eqx.Module):
     so the evaluations are n times that for a gradient, of order 1, and n(n+1)/2 times for a
     Hessian, of order 2 (its symmetry is used).
 
+    JAX can differentiate the result with respect to all that `smooth` can. Its points are placed
+    for the element alone, so these derivatives have more noise than those of `smooth`.
+
     Args:
         order: 1 for the gradient, 2 for the Hessian.
         antithetic: mirror every point, as in the paper.
         quasi: quasi-random points instead of independent ones.
         blur: "all" smooths over all parameters. "own" smooths each derivative over its own
-            parameters only, as FR22 does. Each element is then the derivative of another function.
+            parameters only, as FR22 does. Each element is then the derivative of another function,
+            and has no derivative with respect to parameters and sigma.
 
     Raises:
         ValueError: another order or another `blur`; when it is called, what `smooth` refuses.
+        TypeError: with `blur="own"` a derivative with respect to parameters or sigma.
 
     Example:
         >>> import jax, jax.numpy as jnp, smoothdiff as sd
@@ -144,27 +149,45 @@ class Importance(eqx.Module):
     def _derivative(self, call: Call, key: Any, *args: Any) -> PyTree:
         params = call.params(key, args)
         call.only_smoothed(params, "Importance")
-        n, tree = params.theta.size, params.layout.tree
+        if self.blur == "own":
+            params = replace(params, theta=_fixed(params.theta), sigma=_fixed(params.sigma))
+        n, layout = params.theta.size, params.layout
         order, sampler = self.order, partial(ElementSampler, **vars(self))
+        shift, ratio = displacement(params)
 
         def element(inputs: tuple[Array, Array]) -> Array:
             pair, k = inputs
             batch = replace(call, sampler=sampler(element=pair)).batch(k, args, params, scalar=True)
-            along = lambda i: (jnp.arange(n) == i).astype(params.theta.dtype)
-            zero = jnp.zeros_like(params.theta)
-            first = lambda d: jax.jvp(lambda s: objective(batch, s), (d,), (along(pair[0]),))[1]
-            return first(zero) if order == 1 else jax.jvp(first, (zero,), (along(pair[1]),))[1]
+            along = lambda i: (jnp.arange(n) == i).astype(shift.dtype)
+            value = lambda d: objective(batch, d, ratio)
+            first = lambda d: jax.jvp(value, (d,), (along(pair[0]),))[1]
+            return first(shift) if order == 1 else jax.jvp(first, (shift,), (along(pair[1]),))[1]
 
         # the elements that are sampled: parameters twice, or pairs i <= j
         pairs = np.stack([np.arange(n)] * 2 if order == 1 else np.triu_indices(n), axis=1)
         keys = jax.vmap(lambda e: jax.random.fold_in(as_first_key(key), e))(jnp.arange(len(pairs)))
         out = jax.lax.map(element, (jnp.asarray(pairs), keys)).astype(params.theta.dtype)
         if order == 1:
-            return tree(out / params.sigma)
+            return layout.tree(out / params.sigma)
         i, j = pairs.T
         out = out / (params.sigma[i] * params.sigma[j])
         matrix = jnp.zeros((n, n), out.dtype).at[i, j].set(out).at[j, i].set(out)
-        return jax.tree.map(lambda column: tree(jnp.moveaxis(column, 0, -1)), tree(matrix))
+        rows = layout.tree(matrix)
+        return jax.tree.map(lambda row: layout.alike(jnp.moveaxis(row, 0, -1)), rows)
+
+
+@jax.custom_jvp
+def _fixed(x: Array) -> Array:
+    """What cannot be differentiated, rather than with a derivative of zero."""
+    return x
+
+
+@_fixed.defjvp
+def _(primals: tuple, tangents: tuple) -> tuple:
+    raise TypeError(
+        'with blur="own" each element smooths over its own parameters only, so samples do not say '
+        'how it depends on the others: to differentiate it again use blur="all"'
+    )
 
 
 def difference_hvp(

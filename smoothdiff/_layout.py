@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -52,6 +52,10 @@ class Layout:
             leaves.append(x[..., start:stop].reshape((*x.shape[:-1], *shape)).astype(dtype))
             start = stop
         return self.treedef.unflatten(leaves)
+
+    def alike(self, x: Array) -> PyTree:
+        """As `tree` where all leaves are smoothed, with each in the dtype of `x`."""
+        return replace(self, dtypes=(x.dtype,) * len(self.dtypes)).tree(x)
 
     def check_vector(self, v: PyTree) -> None:
         """Raises an error if `v` is not like the parameters; nothing is broadcast."""

@@ -18,7 +18,8 @@ class Noise(Protocol):
        \log w = \log p\big(\tfrac{x - \theta}{\sigma}\big) - \log p(z) $$
 
     Any object with these two methods is one, among them the distributions of
-    `optax.perturbations`. Derivatives are as good as `log_prob` is smooth.
+    `optax.perturbations`. Derivatives are as good as `log_prob` is smooth. An object that is in use
+    must not change: JAX keeps what was compiled with its first values. For others make another one.
 
     Raises:
         TypeError: from the transforms, for a `noise` that lacks one of these methods.

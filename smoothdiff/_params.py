@@ -85,6 +85,15 @@ class Params:
     sound: Array | None
     free: list[Array]
 
+    def check_free(self) -> None:
+        """Raises TypeError for a leaf that has no derivative."""
+        for leaf in self.free:
+            if not jnp.issubdtype(leaf.dtype, jnp.inexact):
+                raise TypeError(
+                    f"a parameter of dtype {leaf.dtype} has no derivative: make it another "
+                    "argument of the function"
+                )
+
     def clip(self, x: Array) -> Array:
         """The point that the function may see: within the bounds, if there are any."""
         return x if self.low is None else jnp.clip(x, self.low, self.high)

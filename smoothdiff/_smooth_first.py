@@ -127,7 +127,7 @@ def smooth_grad(
 def _value_and_grad(call: Call) -> Callable[..., Any]:
     def g(key: Any, *args: Any) -> PyTree:
         params = call.params(key, args)  # bad arguments are reported before AD hides their values
-        _check_free(params)
+        params.check_free()
         if call.stderr:
             value, aux, grad, error = _first_order(call, key, args, params)
             pair = (value, aux) if call.has_aux else value
@@ -139,16 +139,6 @@ def _value_and_grad(call: Call) -> Callable[..., Any]:
         return ((value, aux) if call.has_aux else value), grad
 
     return g
-
-
-def _check_free(params: Params) -> None:
-    """Raises TypeError for a leaf that has no derivative."""
-    for leaf in params.free:
-        if not jnp.issubdtype(leaf.dtype, jnp.inexact):
-            raise TypeError(
-                f"a parameter of dtype {leaf.dtype} has no derivative: make it another argument of "
-                "the function"
-            )
 
 
 def _first_order(call: Call, key: Any, args: tuple, params: Params) -> tuple:
@@ -229,6 +219,7 @@ def smooth_jacobian(
 
     def g(key: Any, *args: Any) -> PyTree:
         params = call.params(key, args)
+        params.check_free()
         if not call.stderr:
             outputs = jax.eval_shape(lambda: call.smoothed(key, *args)[0])
             size = sum(leaf.size for leaf in jax.tree.leaves(outputs))
@@ -243,8 +234,7 @@ def smooth_jacobian(
 
         def per_parameter(leaf: Array) -> PyTree:
             sigma = jnp.broadcast_to(params.sigma, leaf.shape)
-            tree = params.layout.tree(leaf.astype(sigma.dtype) / sigma)
-            return jax.tree.map(lambda j: j.astype(leaf.dtype), tree)
+            return params.layout.alike((leaf.astype(sigma.dtype) / sigma).astype(leaf.dtype))
 
         estimate = jax.tree.map(per_parameter, jacobian)
         error = jax.tree.map(per_parameter, error)

@@ -65,6 +65,7 @@ def smooth_hessian(
 
     def g(key: Any, *args: Any) -> PyTree:
         params = call.params(key, args)
+        params.check_free()
         if not call.stderr:
             fun = partial(call.smoothed, scalar=True)
             hessian = jax.hessian(fun, call.shifted_argnums(len(args)), has_aux=True)
@@ -82,7 +83,7 @@ def smooth_hessian(
         columns = jax.lax.map(column, jnp.arange(params.theta.size))
         # the Hessian is symmetric: what lax.map stacked in front becomes the last axes
         estimate, error = (
-            jax.tree.map(lambda c: params.layout.tree(jnp.moveaxis(c, 0, -1)), tree)
+            jax.tree.map(lambda c: params.layout.alike(jnp.moveaxis(c, 0, -1)), tree)
             for tree in columns
         )
         return call.out(estimate, batch.aux, error)
@@ -123,7 +124,9 @@ def smooth_hvp(
     Returns:
         `g(key, x, v, *other_args)` with `x, *other_args` the arguments of `fun` and `v` a vector
         with the structure of the arguments that `argnums` names: the product, like `v`; with
-        `has_aux` and `stderr=True` as `smooth`.
+        `has_aux` and `stderr=True` as `smooth`. With a `batch_size` it is compiled once, as by
+        `jax.jit`: what may change from call to call is an argument of `fun`. Of what `fun` only
+        refers to, it keeps the values of the first call.
 
     Raises:
         ValueError, TypeError: as `smooth`; an output that is no scalar; a `v` of another structure
@@ -143,6 +146,7 @@ def smooth_hvp(
     def product(key: Any, x: PyTree, v: PyTree, *other_args: Any) -> PyTree:
         args = (x, *other_args)
         params = call.params(key, args)
+        params.check_free()
         params.layout.check_vector(v)
         if not call.stderr:
 

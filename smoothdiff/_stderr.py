@@ -44,7 +44,7 @@ def value_stderr(batch: Batch, estimate: PyTree) -> PyTree:
 
         back = jnp.zeros_like(known) if constant else known
         center = (mean - (back if mean.ndim else jnp.sum(back))).reshape(-1)
-        scale = jnp.max(jnp.abs(residual))
+        scale = _largest(residual)
         return _spread(batch, sums, (values, residual), center, scale).reshape(mean.shape)
 
     known = _known(batch)(_no_shift(batch))
@@ -57,7 +57,7 @@ def jacobian_stderr(batch: Batch, estimate: PyTree) -> PyTree:
 
     def leaf(residual: Array, known: Array, mean: Array) -> Array:
         columns = (mean - known).reshape(-1, mean.shape[-1]).T
-        scale = jnp.max(jnp.abs(residual))
+        scale = _largest(residual)
 
         def column(direction: Array, column_mean: Array) -> Array:
             def sums(z, log_ratio, rows, shift):
@@ -81,7 +81,7 @@ def grad_stderr(batch: Batch, estimate: Float[Array, " n"]) -> Float[Array, " n"
     residual = batch.control.errors()
     sums = lambda z, log_ratio, rows, shift: _row_grad(batch, z, log_ratio, rows)(shift)
     known = jax.grad(_known_sum(batch))(_no_shift(batch))
-    return _spread(batch, sums, residual, estimate - known, jnp.max(jnp.abs(residual)))
+    return _spread(batch, sums, residual, estimate - known, _largest(residual))
 
 
 @eqx.filter_jit
@@ -96,18 +96,28 @@ def hvp_stderr(
         return jax.jvp(_row_grad(batch, z, log_ratio, rows), (shift,), (tangent,))[1]
 
     known = jax.jvp(jax.grad(_known_sum(batch)), (_no_shift(batch),), (direction,))[1]
-    return _spread(batch, sums, residual, estimate - known, jnp.max(jnp.abs(residual)))
+    return _spread(batch, sums, residual, estimate - known, _largest(residual))
 
 
 @eqx.filter_jit
 def free_grad_stderr(batch: Batch, per_row: Array) -> tuple[Array, Array]:
     """Sum and standard error of a derivative by AD that is given in parts, one for each sample."""
+    if jnp.iscomplexobj(per_row):
+        # both parts have an error of their own
+        parts = free_grad_stderr(batch, jnp.stack([per_row.real, per_row.imag], axis=1))
+        mean, error = (jax.lax.complex(part[0], part[1]) for part in parts)
+        return mean, error
     flat = per_row.reshape(len(per_row), -1)
     mean = jnp.sum(flat, axis=0)
     rows = flat / batch.scale.astype(flat.dtype)
     sums = lambda z, log_ratio, rows, shift: rows
-    error = _spread(batch, sums, rows, mean, jnp.max(jnp.abs(rows)))
+    error = _spread(batch, sums, rows, mean, _largest(rows))
     return mean.reshape(per_row.shape[1:]), error.reshape(per_row.shape[1:])
+
+
+def _largest(rows: Array) -> Array:
+    """The largest magnitude, 0 where there is no number."""
+    return jnp.max(jnp.abs(rows), initial=0)
 
 
 def _no_shift(batch: Batch) -> Float[Array, " n"]:

@@ -77,6 +77,55 @@ def test_leaves_keep_their_own_dtype(key, x64):
     assert all(leaf.dtype == jnp.float64 for leaf in like_out)
 
 
+def test_a_hessian_with_errors_has_the_dtypes_of_one_without(key, x64):
+    """A block has that of its rows, and loses no digits to a narrower one of its columns."""
+    p = {"wide": jnp.ones(2, jnp.float64), "narrow": jnp.ones(3, jnp.float32)}
+    fun = lambda p: jnp.sum(p["wide"]) ** 2 * jnp.sum(p["narrow"]).astype(jnp.float64)
+
+    @jax.jit
+    def run():
+        plain = sd.smooth_hessian(fun, 0.5, **PLAIN)(key, p)
+        by_element = sd.Importance(2)(fun, 0.5, num_samples=2)(key, p)
+        return plain, by_element, *sd.smooth_hessian(fun, 0.5, **PLAIN, stderr=True)(key, p)
+
+    dtypes = lambda tree: jax.tree.map(lambda leaf: leaf.dtype, tree)
+    with jax.numpy_dtype_promotion("standard"):  # which jax.hessian needs for two dtypes
+        plain, *others = run()
+    for other in others:
+        assert dtypes(other) == dtypes(plain)
+    for other in others:
+        block = np.asarray(other["wide"]["narrow"])
+        assert np.any(block != block.astype(np.float32))
+
+
+@pytest.mark.parametrize("baseline", ["auto", "mean", "linear"])
+@pytest.mark.parametrize("batch_size", [None, 8])
+def test_leaves_without_a_number_stay_so(baseline, batch_size, key):
+    """Among outputs, and among parameters that are not smoothed."""
+    options: dict[str, Any] = {"baseline": baseline, "num_samples": 16}
+    p, sigma = {"x": jnp.ones(2), "none": jnp.zeros((0, 3))}, {"x": 0.5, "none": None}
+    sizes = lambda tree: jax.tree.map(jnp.shape, tree)
+
+    def run(stderr):
+        more: dict[str, Any] = {**options, "stderr": stderr, "nonfinite": "drop"}
+        outputs = lambda x: {"square": x**2, "none": jnp.zeros((0, 3))}
+        value = sd.smooth(outputs, 0.5, **more, batch_size=batch_size)(key, p["x"])
+        jacobian = sd.smooth_jacobian(outputs, 0.5, **more, batch_size=batch_size)(key, p["x"])
+        loss = lambda p: jnp.sum(p["x"] ** 2) + jnp.sum(p["none"])
+        return value, jacobian, sd.smooth_grad(loss, sigma, **more)(key, p)
+
+    want = (
+        {"square": (2,), "none": (0, 3)},
+        {"square": (2, 2), "none": (0, 3, 2)},
+        {"x": (2,), "none": (0, 3)},
+    )
+    for shapes, found, pair in zip(
+        want, jax.eval_shape(lambda: run(False)), jax.eval_shape(lambda: run(True)), strict=True
+    ):
+        assert sizes(found) == shapes
+        assert sizes(pair) == (shapes, shapes)
+
+
 @pytest.mark.parametrize("argnums", [0, 1, -1, (0,), (0, 1), (1, 0)])
 def test_argnums_mean_what_they_mean_to_jax(argnums, key):
     fun = lambda x, y, z: jnp.sum(x**2) + y * jnp.sum(x) + z * y**2

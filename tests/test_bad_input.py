@@ -162,6 +162,11 @@ OUTPUTS = {
     "integer": (grad(fun=lambda x: 1), TypeError, r"int32.*astype\(float\)"),
     "boolean": (grad(fun=lambda x: x[0] > 0), TypeError, r"bool.*astype\(float\)"),
     "complex": (grad(fun=lambda x: x[0].astype(jnp.complex64)), TypeError, "complex64.*real"),
+    "nothing": (
+        lambda: sd.smooth(lambda x: {}, 0.5)(KEY, X),
+        TypeError,
+        "returned {}.*return what is to be smoothed",
+    ),
     "no pair for has_aux": (grad(has_aux=True), (TypeError, ValueError), "has_aux"),
 }
 VECTORS = {
@@ -232,6 +237,13 @@ def test_a_bad_argument_raises_and_says_what_to_write(call, error, words):
 def test_a_scalar_is_asked_for_where_one_is_needed(transform, fun):
     with pytest.raises(TypeError, match=r"scalar.*smooth_jacobian"):
         transform(fun, 0.5)(KEY, X)
+
+
+@pytest.mark.parametrize("transform", [sd.smooth_grad, sd.smooth_jacobian, sd.smooth_hessian])
+def test_integers_that_are_not_smoothed_have_no_derivative(transform):
+    p = {"a": X, "b": jnp.array(1)}
+    with pytest.raises(TypeError, match=r"int32 has no derivative: make it another argument"):
+        transform(tree_fun, NONE)(KEY, p)
 
 
 def test_the_same_messages_from_every_transform():

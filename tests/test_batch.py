@@ -206,6 +206,14 @@ def test_chunks_change_only_the_rounding(sampler, num_samples, batch_size, key):
     assert_same(*with_and_without_chunks(run, sampler, num_samples, batch_size))
 
 
+@pytest.mark.parametrize("impl", ["rbg", "unsafe_rbg"])
+def test_chunks_change_only_the_rounding_for_keys_of_every_kind(impl):
+    key = jax.random.key(0, impl=impl)
+    run = lambda options: sd.smooth_grad(boxes, 0.4, **options)(key, X)
+    for sampler in (sd.Gaussian(), sd.Sobol(replicates=4)):
+        assert_same(*with_and_without_chunks(run, sampler, 16, 4))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("sampler", "num_samples", "batch_size"), sizes("weighted", "parts of replicates")

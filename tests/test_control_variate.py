@@ -239,6 +239,8 @@ def test_what_zerograds_has_learnt_lowers_the_variance(settings, steps):
 
 
 def test_bad_input():
+    with pytest.raises(ValueError, match="use smooth_value_and_grad"):
+        sd.control_variate(sd.smooth_quadratic, near, near, 0.1)
     with pytest.raises(ValueError, match="aux"):
         sd.control_variate(sd.smooth, near, near, 0.1, has_aux=True)
     with pytest.raises(TypeError, match="one random key"):

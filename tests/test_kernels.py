@@ -120,6 +120,40 @@ def test_the_tails_are_finite_and_right(order, dtype):
 
 
 @pytest.mark.parametrize("order", ORDERS)
+def test_the_inverse_is_right_at_the_smallest_probabilities(order, dtype):
+    u = jnp.asarray([1e-37, 1e-30, 1e-20], dtype)
+    want = [
+        -SIGMA * optimize.brentq(lambda t, p=p: np.log(tail(t, order) / p), 0, 30, xtol=1e-14)  # pyright: ignore
+        for p in np.asarray(u, float)
+    ]
+    eps = float(jnp.finfo(dtype).eps)
+    np.testing.assert_allclose(inverse_cdf(u, SIGMA, order), want, rtol=20 * eps)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_the_inverse_has_the_derivative_of_an_inverse(order, dtype):
+    u = jnp.asarray([1e-20, 1e-3, 0.2, 0.3, 0.6, 0.99], dtype)
+    slopes = jax.vmap(jax.jacfwd(lambda u: inverse_cdf(u, SIGMA, order)))(u)
+    want = jnp.exp(-log_density(inverse_cdf(u, SIGMA, order), SIGMA, order))
+    np.testing.assert_allclose(slopes, want, rtol=500 * float(jnp.finfo(dtype).eps))
+    back = jax.vmap(jax.grad(lambda u: inverse_cdf(u, SIGMA, order)))(u)
+    np.testing.assert_allclose(back, slopes, rtol=1e-6)
+    if order != 1:  # where the density of order 1 vanishes
+        middle = jax.grad(lambda u: inverse_cdf(u, SIGMA, order))(jnp.asarray(0.5, dtype))
+        np.testing.assert_allclose(middle, 1 / density(order)(0.0), rtol=1e-5)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_far_away_all_is_at_its_limit(order, dtype):
+    far = jnp.asarray([-jnp.inf, -jnp.finfo(dtype).max, jnp.finfo(dtype).max, jnp.inf], dtype)
+    np.testing.assert_array_equal(cdf(far, SIGMA, order), [0, 0, 1, 1])
+    np.testing.assert_array_equal(derivative(far, SIGMA, order), 0)
+    np.testing.assert_array_equal(log_density(far, SIGMA, order), -jnp.inf)
+    slopes = jax.vmap(jax.grad(lambda x: cdf(x, SIGMA, order)))(far)
+    np.testing.assert_array_equal(slopes, 0)
+
+
+@pytest.mark.parametrize("order", ORDERS)
 def test_samples_pass_a_kolmogorov_smirnov_test(order, dtype):
     u = jax.random.uniform(jax.random.key(order), (20_000,), dtype, minval=2**-24, maxval=1)
     x = np.asarray(inverse_cdf(u, SIGMA, order), float)

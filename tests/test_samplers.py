@@ -440,6 +440,31 @@ def test_importance_is_unbiased_by_default(blur):
     )
 
 
+@pytest.mark.parametrize("order", [1, 2])
+def test_importance_can_be_differentiated(order):
+    """With respect to the parameters and sigma, against AD of the closed form."""
+    wave = lambda x: jnp.sin(x[0] + 2 * x[1])
+    smoothed = lambda x, s: jnp.exp(-(s[0] ** 2 + 4 * s[1] ** 2) / 2) * wave(x)
+    exact = jax.grad(smoothed) if order == 1 else jax.hessian(smoothed)
+    x, s = jnp.array([0.3, 0.4]), jnp.array([0.8, 0.5])
+    estimate = lambda x, s, k: sd.Importance(order)(wave, s, num_samples=64)(k, x)
+    found = jax.jit(jax.vmap(jax.jacfwd(estimate, (0, 1)), (None, None, 0)))(x, s, keys(1000))
+    for estimates, want in zip(found, jax.jacfwd(exact, (0, 1))(x, s), strict=True):
+        assert_unbiased(estimates, want, resolution=0.05)
+
+
+def test_importance_over_own_parameters_says_that_it_has_no_derivative(key):
+    estimate = lambda x, s: sd.Importance(1, blur="own")(jnp.sum, s, num_samples=4)(key, x)
+    for argnums in (0, 1):
+        with pytest.raises(TypeError, match='to differentiate it again use blur="all"'):
+            jax.jacfwd(estimate, argnums)(jnp.ones(2), 0.5)
+    # what the function depends on besides can be differentiated
+    scaled = lambda a: sd.Importance(1, blur="own")(
+        lambda x, a: a * jnp.sum(x), 0.5, num_samples=4, baseline="none"
+    )(key, jnp.ones(2), a)
+    np.testing.assert_allclose(jax.jacfwd(scaled)(2.0), scaled(1.0), rtol=1e-5)
+
+
 def test_points_of_one_parameter_have_no_fit():
     for baseline in ("gp", "linear", "quadratic"):
         with pytest.raises(ValueError, match='blur="own" goes with baseline="mean"'):

@@ -256,6 +256,18 @@ def test_errors_of_leaves_that_are_differentiated_by_ad(antithetic):
         np.testing.assert_allclose(np.mean(error["y"]), coin, rtol=0.02)
 
 
+def test_the_error_of_a_complex_leaf_is_that_of_each_part():
+    """d/dc of the real part of c exp(ix), whose two parts spread apart from each other."""
+    fun = lambda p: jnp.real(jax.lax.complex(jnp.cos(p["x"]), jnp.sin(p["x"])) * p["c"])
+    options: dict[str, Any] = {**PLAIN, "num_samples": 128, "stderr": True}
+    p = {"x": jnp.float32(0.2), "c": jnp.asarray(1 + 0j, jnp.complex64)}
+    g = lambda key: sd.smooth_grad(fun, {"x": 0.5, "c": None}, **options)(key, p)
+    found, error = (leaf["c"] for leaf in jax.jit(jax.vmap(g))(keys(2000)))
+    for part in (np.real, np.imag):
+        ratio = np.sqrt(np.mean(np.square(part(error)))) / np.std(part(found))
+        np.testing.assert_allclose(ratio, 1.0, atol=0.07)
+
+
 def test_errors_of_a_constant_and_of_an_offset(key):
     x = THETA[:2]
 
