@@ -194,6 +194,9 @@ def test_a_run_that_was_cut_short_needs_more_evaluations():
     assert more.y == result.y
     with pytest.raises(ValueError, match="fun returned 7 residuals, and 30 in the run"):
         sd.with_covariance(lambda y, _: jnp.ones(7), result)
+    swapped: Any = (result, lambda y, _: jnp.ones(30))
+    with pytest.raises(TypeError, match=r"not function: write sd\.with_covariance\(fun, result\)"):
+        sd.with_covariance(*swapped)
 
 
 def test_where_the_function_takes_a_key_a_warning_says_to_give_one():
