@@ -150,6 +150,10 @@ def test_what_the_residuals_do_not_depend_on_is_nan(model, unknown):
     closed = np.sqrt(2 * result.fun / 27 * np.diag(np.linalg.inv(design.T @ design)))
     known = [j for j in range(2) if j not in unknown]
     np.testing.assert_allclose(errors[known], closed[known], rtol=1e-3)
+    more: Any = sd.with_covariance(lambda y, data: model(y) - data, result, data)
+    with pytest.warns(UserWarning, match="Either they do not, or only on a combination"):
+        errors = np.asarray(more.parameter_errors)
+    assert np.flatnonzero(np.isnan(errors)).tolist() == unknown
 
 
 def test_as_many_parameters_as_residuals_have_none():
