@@ -71,10 +71,14 @@ def ctrl_c_noticed() -> Iterator[None]:
     evaluates the rest of a batch. In a hook of JAX's the exception is dropped, or becomes another
     one. So the signal itself is looked for; but not in other threads, nor where Ctrl-C means
     something else.
+
+    A run may be part of an evaluation of another run, in whatever thread. Then it raises
+    KeyboardInterrupt in place of what it found, as that other run must not take it for a value.
     """
     alone = threading.current_thread() is threading.main_thread()
     if not alone or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         yield
+        raise_if_pressed()
         return
     before, outer = None, len(_watch.pressed)
     try:
@@ -84,7 +88,11 @@ def ctrl_c_noticed() -> Iterator[None]:
     finally:
         if before is not None:
             _watch.end(before)
+        pressed = any(_watch.pressed[outer:])
         del _watch.pressed[outer:]
+        if outer:
+            _watch.pressed[-1] |= pressed
+    raise_if_pressed()
 
 
 def raise_if_pressed() -> None:

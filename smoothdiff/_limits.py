@@ -60,9 +60,10 @@ class Limits(NamedTuple):
             return Limits(steps, None, seconds, goal, steps)
         room = evaluations - final - step
         if room < 0:
+            fewer = ", or lower the solver's num_samples" if step > 1 else ""
             raise NoRoomError(
                 f"max_evaluations={max_evaluations} leaves no room: a step takes {step}, judging "
-                f"the result {final}. Allow {step + final}, or lower the solver's num_samples"
+                f"the result {final}. Allow {step + final}{fewer}"
             )
         fit = room // step + 1
         return Limits(steps, room, seconds, goal, fit if steps is None else min(fit, steps))

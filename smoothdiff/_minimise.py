@@ -161,7 +161,8 @@ def least_squares(
 
     The twin of `minimise` for functions that return residuals, such as an image minus its
     reference. An evaluation teaches all of them, so far fewer are needed. The iterates are those of
-    `optimistix.least_squares(fun, solver, y0, args, options={"key": key})`.
+    `optimistix.least_squares(fun, solver, y0, args, options={"key": key})`. Unlike in `minimise`, a
+    parameter that changes nothing may end far from its start. Its error is NaN.
 
     Args:
         fun: the residuals, `fun(y, args)`, an array or a pytree of arrays. May contain a black box.

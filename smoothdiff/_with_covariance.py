@@ -58,6 +58,7 @@ def with_covariance(
         ValueError: the result has no covariance, as it is of `minimise`, of `LocalGaussNewton` or
             of 100 parameters or more; `fun` returns another number of residuals; a key is missing,
             or given to a function that takes none.
+        TypeError: `result` is no result, as where it comes before `fun`.
         BlackBoxError: an evaluation failed.
 
     Example:
@@ -72,6 +73,11 @@ def with_covariance(
 
     Source: own.
     """
+    if not isinstance(result, Result):
+        raise TypeError(
+            f"result must be what least_squares returned, not {type(result).__name__}: write "
+            "sd.with_covariance(fun, result)"
+        )
     answer, history = result.answer, kept_residuals(result)
     if answer is None or history is None:
         raise ValueError(NO_COVARIANCE)

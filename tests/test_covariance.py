@@ -150,6 +150,10 @@ def test_what_the_residuals_do_not_depend_on_is_nan(model, unknown):
     closed = np.sqrt(2 * result.fun / 27 * np.diag(np.linalg.inv(design.T @ design)))
     known = [j for j in range(2) if j not in unknown]
     np.testing.assert_allclose(errors[known], closed[known], rtol=1e-3)
+    more: Any = sd.with_covariance(lambda y, data: model(y) - data, result, data)
+    with pytest.warns(UserWarning, match="Either they do not, or only on a combination"):
+        errors = np.asarray(more.parameter_errors)
+    assert np.flatnonzero(np.isnan(errors)).tolist() == unknown
 
 
 def test_as_many_parameters_as_residuals_have_none():
@@ -194,6 +198,9 @@ def test_a_run_that_was_cut_short_needs_more_evaluations():
     assert more.y == result.y
     with pytest.raises(ValueError, match="fun returned 7 residuals, and 30 in the run"):
         sd.with_covariance(lambda y, _: jnp.ones(7), result)
+    swapped: Any = (result, lambda y, _: jnp.ones(30))
+    with pytest.raises(TypeError, match=r"not function: write sd\.with_covariance\(fun, result\)"):
+        sd.with_covariance(*swapped)
 
 
 def test_where_the_function_takes_a_key_a_warning_says_to_give_one():

@@ -47,6 +47,34 @@ def test_no_evaluation_begins_after_it(num_samples, at):
     assert calls == at
 
 
+@pytest.mark.parametrize("num_samples", [1, 8])
+@pytest.mark.parametrize("at", [25, 100])
+def test_a_run_within_an_evaluation_gives_no_value_and_both_end(num_samples, at):
+    """What it has found is not what the evaluation would have been."""
+    calls, begun, values = 0, 0, []
+
+    def inner(y):
+        nonlocal calls
+        calls += 1
+        if calls == at:
+            signal.raise_signal(signal.SIGINT)
+        return stairs(y)
+
+    box = sd.black_box(inner, 0.0)
+
+    def host(y):
+        nonlocal begun
+        begun += 1
+        values.append(stairs(y) + np.float32(run(box, max_steps=10).fun))
+        return values[-1]
+
+    result = run(sd.black_box(host, 0.0), sd.NewtonCG(0.2, num_samples=num_samples))
+    assert result.reason == "interrupted"
+    assert calls == at
+    assert len(values) == begun - 1
+    assert result.fun in (*values, np.inf)
+
+
 def test_calls_of_threads_are_given_up():
     calls, entered = 0, threading.Event()
 

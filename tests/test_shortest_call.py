@@ -316,6 +316,14 @@ def test_limits_that_are_none_are_refused(limit, match):
         minimise(bowl, jnp.ones(3), key=KEY, **limit)
 
 
+@pytest.mark.parametrize(("num_samples", "fewer"), [(None, False), (1, False), (4, True)])
+def test_fewer_samples_are_advised_where_there_are_several(num_samples, fewer):
+    solver = sd.NewtonCG(0.2, num_samples=num_samples)
+    with pytest.raises(ValueError, match="leaves no room") as error:
+        minimise(bowl, jnp.ones(3), key=KEY, solver=solver, max_evaluations=3)
+    assert ("num_samples" in str(error.value)) == fewer
+
+
 # under optimistix
 
 
