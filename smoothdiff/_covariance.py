@@ -158,7 +158,8 @@ def covariance(
     signal, turn = np.linalg.eigh(back.T @ known.squares[at] @ back)
     directions = back @ turn
     share = np.einsum("ik,ij,jk->k", directions, known.curved[at], directions)
-    none = signal <= 1 / _NOISY
+    # rounding may be the same for all residuals, and look like a slope
+    none = signal <= 1 / (_CURVED if known.rounding else _NOISY)
     alike = 1 if known.rounding else share + (1 - share) / residuals
     told = ~none & (signal > alike / _CURVED)
     part = directions[:, told]

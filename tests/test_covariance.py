@@ -405,7 +405,7 @@ def test_rounding_is_no_slope_of_what_changes_nothing_nearby(x64):
         return swings + 0.1 * jnp.asarray(y["k"], float) * times()
 
     start, truth = ({"a": 1.0, "b": 0.1, "c": 0.1, "k": 1}, {"a": 2.0, "b": 0.5, "c": 0.4, "k": 3})
-    for seed in range(4):
+    for seed in range(8):
         data = noisy(model, truth, 0.05, jax.random.key(seed))
         result = fitted(model, data, start, space=space)
         with pytest.warns(UserWarning, match="no error of k, and the others are for them"):
