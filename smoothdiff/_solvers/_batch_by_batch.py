@@ -18,7 +18,6 @@ from smoothdiff._solvers._base import (
     promotion,
     read_options,
     smoothed_params,
-    unless_failed,
 )
 from smoothdiff._solvers._batch_search import BatchSearch
 from smoothdiff._solvers._evaluator import Evaluator, half_squares
@@ -33,6 +32,7 @@ from smoothdiff._solvers._residual_batch import (
     fresh_loss,
 )
 from smoothdiff._solvers._restarts import Restarts
+from smoothdiff._solvers._where import where
 from smoothdiff._solvers._wide_rounds import LONGEST, further, next_scale, sides_of
 
 # evaluations a step of a problem with many parameters
@@ -179,7 +179,7 @@ def step(
         small = moved < solver.atol + solver.rtol * solver.norm(y)
     finite = batch.enough(solver.nonfinite) & all_finite((fun, theta, scale))
     after = search.after(scale, history, theta - params.theta, ~same, fun, small)
-    new_y, after = unless_failed(finite, (new_y, after), (y, search))
+    new_y, after = where(finite, (new_y, after), (y, search))
     seen = Seen(params.layout.tree(point), there)
     rest = sigma, batch.count + tried, finite, seen, batch.overflowed
     progress = progress.after(y, fun, stderr, *rest)

@@ -20,7 +20,6 @@ from smoothdiff._solvers._base import (
     promotion,
     read_options,
     smoothed_params,
-    unless_failed,
 )
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import judged, judging, one_by_one
@@ -29,6 +28,7 @@ from smoothdiff._solvers._random_numbers import in_step
 from smoothdiff._solvers._ratio_test import are_level
 from smoothdiff._solvers._regression_step import Center
 from smoothdiff._solvers._restarts import Restarts
+from smoothdiff._solvers._where import where
 from smoothdiff._stderr import value_stderr
 
 # the most entries of the points that are kept by default, 128 MB in float64
@@ -146,7 +146,7 @@ def step(
     )
     new_y = params.layout.tree(after.theta)
     finite = all_finite((batch.values if batch.valid is None else batch.scale, after.theta))
-    going = unless_failed(finite, (new_y, after, history), (y, state.center, state.history))
+    going = where(finite, (new_y, after, history), (y, state.center, state.history))
     width = center.trust.width * metric.widest()
     progress = progress.after(y, value, stderr, width, len(z), finite, seen)
     restarts = state.restarts

@@ -27,12 +27,12 @@ from smoothdiff._solvers._base import (
     read_options,
     sigma_at,
     stopped,
-    unless_failed,
 )
 from smoothdiff._solvers._judgement import judged, judging, one_by_one
 from smoothdiff._solvers._optax import check_optax, updated
 from smoothdiff._solvers._path_length import PathLength, steps_scaled
 from smoothdiff._solvers._random_numbers import in_step
+from smoothdiff._solvers._where import where
 
 # so many small updates in a row count as convergence: under noise a single one is luck
 _PATIENCE = 5
@@ -216,7 +216,7 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
                 state.length.after(params, grad, self.num_samples),
                 state.length.failed(),
             )
-        new_y, opt_state, average, length = unless_failed(
+        new_y, opt_state, average, length = where(
             finite,
             (new_y, opt_state, average, length),
             (y, state.opt_state, state.average, after),

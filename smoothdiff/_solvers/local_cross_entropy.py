@@ -22,13 +22,13 @@ from smoothdiff._solvers._base import (
     promotion,
     read_options,
     stopped,
-    unless_failed,
 )
 from smoothdiff._solvers._evaluator import Evaluator
 from smoothdiff._solvers._judgement import by_rows, judged, judging
 from smoothdiff._solvers._local_ensemble import Blame
 from smoothdiff._solvers._random_numbers import in_step
 from smoothdiff._solvers._residual_batch import ResidualBatch, around, check_terms, fresh_loss
+from smoothdiff._solvers._where import where
 from smoothdiff._support import AbstractSupport, as_support
 
 # the share of a population that the next one is like, and the fewest of them that have a spread
@@ -212,7 +212,7 @@ class LocalCrossEntropy(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             narrow = width < self.atol + self.rtol * self.norm(new_y)
         small = jnp.where(narrow, state.small + 1, 0)
         finite = population.enough(self.nonfinite) & all_finite((fun, theta, wide))
-        new_y, wide = unless_failed(finite, (new_y, wide), (y, spread))
+        new_y, wide = where(finite, (new_y, wide), (y, spread))
         point, there = seen.lowest()
         # a population over the bounds says nothing of the function around the start
         fun = jnp.where(anywhere, jnp.nan, fun)

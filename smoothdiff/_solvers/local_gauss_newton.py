@@ -22,7 +22,6 @@ from smoothdiff._solvers._base import (
     read_options,
     smoothed_params,
     stopped,
-    unless_failed,
 )
 from smoothdiff._solvers._evaluator import Evaluator
 from smoothdiff._solvers._judgement import by_rows, judged, judging
@@ -40,6 +39,7 @@ from smoothdiff._solvers._residual_batch import (
     check_terms,
     fresh_loss,
 )
+from smoothdiff._solvers._where import where
 from smoothdiff._support import AbstractSupport, as_support
 
 # ends that are evaluated in a step: one for each damping, and the best of each place
@@ -213,7 +213,7 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             moved = self.norm(params.layout.tree(jnp.abs(theta - params.theta) + sigma))
             small = jnp.where(moved < self.atol + self.rtol * self.norm(y), state.small + 1, 0)
         finite = batch.enough(self.nonfinite) & all_finite((fun, theta, scale))
-        new_y, scale = unless_failed(finite, (new_y, scale), (y, state.scale))
+        new_y, scale = where(finite, (new_y, scale), (y, state.scale))
         point, there = batch.lowest()
         point, there = jnp.where(at_end < there, theta, point), jnp.minimum(there, at_end)
         seen = Seen(params.layout.tree(point), there)

@@ -24,7 +24,6 @@ from smoothdiff._solvers._base import (
     sigma_at,
     smoothed_params,
     stopped,
-    unless_failed,
 )
 from smoothdiff._solvers._descent import as_optimizer, descended
 from smoothdiff._solvers._judgement import judged, judging, one_by_one
@@ -33,6 +32,7 @@ from smoothdiff._solvers._optax import check_optax
 from smoothdiff._solvers._random_numbers import in_step
 from smoothdiff._solvers._replay import Replay
 from smoothdiff._solvers._surrogate_fit import Fit, Settings
+from smoothdiff._solvers._where import where
 from smoothdiff.surrogates import MLP
 
 # so many small updates in a row count as convergence, as in FirstOrder
@@ -271,7 +271,7 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
             stall = jnp.where(moved < self.atol + self.rtol * length, state.stall + 1, 0)
         finite = all_finite((fit.weights, fit.spread, new_y))
         new, old = (new_y, fit, opt_state), (y, state.fit, state.opt_state)
-        new_y, fit, opt_state = unless_failed(finite, new, old)
+        new_y, fit, opt_state = where(finite, new, old)
         fun, stderr = locality.mean(batch)
         sigma = sigma_at(self.sigma, progress.step)
         progress = progress.after(y, fun, stderr, sigma, self.num_samples, finite, seen)
