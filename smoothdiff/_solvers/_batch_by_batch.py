@@ -78,6 +78,11 @@ def final_evaluations(solver: Any, y: PyTree[Array]) -> int:
     return judging(evaluations_per_step(solver, y), new=1, old=2)
 
 
+def over(solver: Any, state: BatchState) -> Array:
+    """Whether the last steps were small."""
+    return state.search.converged()
+
+
 def _points(solver: Any, params: Params, key: Array, sigma: Array, count: int) -> Array:
     # few Sobol points are all but the same in some pairs of very many dimensions
     sampler = solver.sampler or (Sobol() if params.theta.size < MANY else Gaussian())

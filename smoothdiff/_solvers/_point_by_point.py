@@ -22,7 +22,7 @@ from smoothdiff._solvers._box import anywhere, bounded
 from smoothdiff._solvers._convergence import signs
 from smoothdiff._solvers._evaluator import Evaluator, objectives
 from smoothdiff._solvers._history import History
-from smoothdiff._solvers._judgement import Contest, Values, evaluated, judging
+from smoothdiff._solvers._judgement import Contest, Values, evaluated
 from smoothdiff._solvers._look import Look
 from smoothdiff._solvers._looking_search import AbstractLookingSearch
 from smoothdiff._solvers._random_numbers import in_step, takes_key
@@ -59,14 +59,6 @@ class PointState(eqx.Module):
 def patience(n: int, num_samples: int | None) -> int:
     """The default, in evaluations."""
     return max(_PATIENCE * (n + 1), _STEPS * (num_samples or 1))
-
-
-def final_evaluations(candidates: int) -> int:
-    """The best point again, and so many candidates of the search; with noise the start as well.
-
-    With a key there are up to three candidates in three rounds, which are fewer.
-    """
-    return judging(0, new=candidates, old=1)
 
 
 def init(
