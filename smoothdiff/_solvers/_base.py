@@ -129,6 +129,12 @@ def stopped(
     return enough | ~progress.finite, result
 
 
+def is_small(solver: Any, move: PyTree[Array], y: PyTree[Array]) -> Bool[Array, ""]:
+    """Whether a step, or how wide one samples, is within the solver's tolerance at `y`."""
+    with promotion():
+        return solver.norm(move) < solver.atol + solver.rtol * solver.norm(y)
+
+
 def check_settings(solver: Any) -> None:
     """Raises TypeError or ValueError unless those settings hold that several solvers have."""
     for field in dataclasses.fields(solver):

@@ -9,27 +9,28 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from smoothdiff._layout import layout_of
 from smoothdiff._params import Params
 from smoothdiff._samplers import Gaussian, Sobol
 from smoothdiff._seen import Seen, kept
 from smoothdiff._solvers._base import (
     Progress,
     all_finite,
-    promotion,
+    is_small,
     read_options,
     smoothed_params,
 )
 from smoothdiff._solvers._batch_search import BatchSearch
 from smoothdiff._solvers._evaluator import Evaluator, half_squares
 from smoothdiff._solvers._history import History
-from smoothdiff._solvers._judgement import by_rows, judged, judging
+from smoothdiff._solvers._judgement import judging
 from smoothdiff._solvers._local_steps import TRIED, steps_to_try
 from smoothdiff._solvers._parameter_regression import gauss_newton_step
 from smoothdiff._solvers._random_numbers import in_step
 from smoothdiff._solvers._residual_batch import (
     ResidualBatch,
     around,
-    fresh_loss,
+    judge_rows,
 )
 from smoothdiff._solvers._restarts import Restarts
 from smoothdiff._solvers._where import where
@@ -144,7 +145,7 @@ def step(
     progress, search = state.progress, state.search
     params = smoothed_params(solver, y, progress.step, options)
     numbers = in_step(args, options, progress.step)
-    residuals = Evaluator(fn, numbers, params.layout, True, solver.batch_size, solver.sharding)
+    residuals = _evaluator(solver, fn, numbers, y)
     key = jax.random.fold_in(read_options(options)[0], progress.step)
     count, _, tried = sizes_of(solver, y)
     sigma = params.sigma * search.scale
@@ -179,9 +180,7 @@ def step(
 
     fun, stderr = batch.loss()
     new_y = params.layout.tree(theta)
-    with promotion():
-        moved = solver.norm(params.layout.tree(jnp.abs(theta - params.theta) + sigma))
-        small = moved < solver.atol + solver.rtol * solver.norm(y)
+    small = is_small(solver, params.layout.tree(jnp.abs(theta - params.theta) + sigma), y)
     finite = batch.enough(solver.nonfinite) & all_finite((fun, theta, scale))
     after = search.after(scale, history, theta - params.theta, ~same, fun, small)
     new_y, after = where(finite, (new_y, after), (y, search))
@@ -204,25 +203,22 @@ def judge(
 ) -> tuple[PyTree[Array], dict[str, Array]]:
     """Judges all that was seen and the last iterate; with noise also the start and the best."""
     progress = state.progress
-    key = jax.random.fold_in(read_options(options)[0], progress.step)
     count = evaluations_per_step(solver, y)
     # with restarts, on the width on which the lowest estimate was made
     scale = state.search.scale if state.restarts is None else state.restarts.kernel
 
-    def estimate(y):
+    def samples(y: PyTree[Array], key: Array) -> Array:
         params = smoothed_params(solver, y, progress.step, options)
-        points = _points(solver, params, key, params.sigma * scale, count)
-        numbers = in_step(args, options, progress.step)
-        residuals = Evaluator(fn, numbers, params.layout, True, solver.batch_size, solver.sharding)
-        return fresh_loss(residuals, points, solver.nonfinite)
+        return _points(solver, params, key, params.sigma * scale, count)
 
-    params = smoothed_params(solver, y, progress.step, options)
-    values = by_rows(
-        Evaluator(fn, args, params.layout, True, solver.batch_size, solver.sharding), options
-    )
     # every iterate but the last was evaluated
-    old = progress.start_y, progress.best_y
-    return judged(progress, values, estimate, count, [y], old)
+    new, old = [y], (progress.start_y, progress.best_y)
+    evaluate = _evaluator(solver, fn, args, y)
+    return judge_rows(progress, evaluate, options, solver.nonfinite, samples, count, new, old)
+
+
+def _evaluator(solver: Any, fn: Any, args: PyTree, y: PyTree[Array]) -> Evaluator:
+    return Evaluator(fn, args, layout_of(y), True, solver.batch_size, solver.sharding)
 
 
 def _best(

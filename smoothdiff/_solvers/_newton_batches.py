@@ -17,7 +17,7 @@ from smoothdiff._seen import watched
 from smoothdiff._solvers._base import (
     Progress,
     all_finite,
-    promotion,
+    is_small,
     read_options,
     smoothed_params,
 )
@@ -129,11 +129,6 @@ def step(
     values = batch.values.astype(points.dtype)
     history = state.history.after(points, values[:, None], values, good, jnp.asarray(len(z)))
 
-    def small(move: Array) -> Array:
-        with promotion():
-            length = solver.norm(params.layout.tree(move))
-            return length < solver.atol + solver.rtol * solver.norm(y)
-
     after, value, stderr = center.stepped(
         params,
         history.points,
@@ -142,7 +137,7 @@ def step(
         adaptive,
         returns=jnp.asarray(False),
         level=are_level(values, good),
-        small=small,
+        small=lambda move: is_small(solver, params.layout.tree(move), y),
     )
     new_y = params.layout.tree(after.theta)
     finite = all_finite((batch.values if batch.valid is None else batch.scale, after.theta))

@@ -22,6 +22,7 @@ from smoothdiff._solvers._base import (
     Progress,
     all_finite,
     check_settings,
+    is_small,
     project,
     promotion,
     read_options,
@@ -206,9 +207,8 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
         average = jax.tree.map(
             lambda a, new: a + share.astype(a.dtype) * (new - a), state.average, new_y
         )
-        with promotion():
-            moved, size = self.norm(jax.tree.map(jnp.subtract, new_y, y)), self.norm(y)
-            stall = jnp.where(moved < self.atol + self.rtol * size, state.stall + 1, 0)
+        small = is_small(self, jax.tree.map(jnp.subtract, new_y, y), y)
+        stall = jnp.where(small, state.stall + 1, 0)
         finite = all_finite((fun, grad, new_y))
         length = after = None
         if state.length is not None:

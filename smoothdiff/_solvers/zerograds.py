@@ -19,7 +19,7 @@ from smoothdiff._solvers._base import (
     Progress,
     all_finite,
     check_settings,
-    promotion,
+    is_small,
     read_options,
     sigma_at,
     smoothed_params,
@@ -266,9 +266,8 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
             read_options(options)[1],
             length=self.parameter_steps,
         )
-        with promotion():
-            moved, length = self.norm(jax.tree.map(jnp.subtract, new_y, y)), self.norm(y)
-            stall = jnp.where(moved < self.atol + self.rtol * length, state.stall + 1, 0)
+        small = is_small(self, jax.tree.map(jnp.subtract, new_y, y), y)
+        stall = jnp.where(small, state.stall + 1, 0)
         finite = all_finite((fit.weights, fit.spread, new_y))
         new, old = (new_y, fit, opt_state), (y, state.fit, state.opt_state)
         new_y, fit, opt_state = where(finite, new, old)
