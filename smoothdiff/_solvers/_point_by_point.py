@@ -18,7 +18,7 @@ from smoothdiff._solvers._base import (
     read_options,
     smoothed_params,
 )
-from smoothdiff._solvers._box import anywhere, bounded
+from smoothdiff._solvers._box import anywhere
 from smoothdiff._solvers._convergence import signs
 from smoothdiff._solvers._evaluator import Evaluator, objectives
 from smoothdiff._solvers._history import History
@@ -80,9 +80,7 @@ def init(
                 "function ends: call minimise from several starts instead"
             )
         search = search.averaging()
-    elif not solver.squares or bounded(
-        smoothed_params(solver, y, jnp.asarray(0, jnp.int32), options)
-    ):
+    elif not solver.squares or read_options(options)[1] is not None:
         search = dataclasses.replace(search, look=Look.start(search.start))
     if solver.sampler is not None:
         draw = lambda key: _normal_points(solver, key, 1, search.start)

@@ -223,13 +223,13 @@ class QuadraticTrust(eqx.Module):
         self, hessian: Array, grad: Array, radius: Array, center: Array, params: Params
     ) -> Array:
         """The minimiser within the radius that leaves no bound."""
-        if params.low is None or params.high is None:
+        if params.bounds is None:
             return bounded_step(hessian, grad, radius, None, None)
         # the bounds are those of the parameters, in units of sigma
         sigma = params.sigma
         units = self.metric.into(jnp.diag(sigma))
         bend, slope = dot(dot(units, hessian), units.T), dot(units, grad)
-        low, high = (params.low - center) / sigma, (params.high - center) / sigma
+        low, high = ((side - center) / sigma for side in params.bounds)
         step = bounded_step(bend, slope, radius, low, high, dot(units, units.T))
         return self.metric.into(params.clip(center + sigma * step) - center)
 

@@ -144,15 +144,16 @@ def _bounded(
     params: Params, metric: Metric, base: Array, u: Array, width: Array, mirror: bool
 ) -> Array:
     """The point u widths from `base`, within the bounds if there are any."""
-    if params.low is None or params.high is None:
+    if params.bounds is None:
         return base + metric.out(width * u)
-    return metric.bounded(base, width * u, params.low, params.high, mirror)
+    return metric.bounded(base, width * u, *params.bounds, mirror)
 
 
 def _held(params: Params, x: Array, slope: Array, width: Array) -> Array | None:
     """Which parameters are at a bound that the descent would cross; None without bounds."""
-    if params.low is None or params.high is None:
+    if params.bounds is None:
         return None
+    low, high = params.bounds
     # a step to a bound ends there but for rounding
     near = 100 * jnp.finfo(x.dtype).eps * (jnp.abs(x) + width)
-    return ((x <= params.low + near) & (slope > 0)) | ((x >= params.high - near) & (slope < 0))
+    return ((x <= low + near) & (slope > 0)) | ((x >= high - near) & (slope < 0))

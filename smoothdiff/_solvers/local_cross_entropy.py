@@ -249,21 +249,22 @@ def _bounded(params: Params) -> bool:
 
 def _span(params: Params) -> Float[Array, " n"]:
     """How far apart the bounds are."""
-    if params.low is None or params.high is None:
+    if params.bounds is None:
         return jnp.full_like(params.theta, jnp.inf)
-    return params.high - params.low
+    low, high = params.bounds
+    return high - low
 
 
 def _even(params: Params, key: Array, count: int) -> Float[Array, "count n"]:
     """Points over the bounds, for each parameter one in each of so many equal parts."""
-    if params.low is None:
+    if params.bounds is None:
         return jnp.full((count, params.theta.size), jnp.nan, params.theta.dtype)
     layer, place = jax.random.split(key)
     shape, dtype = (count, params.theta.size), params.theta.dtype
     numbers = jnp.broadcast_to(jnp.arange(count, dtype=dtype)[:, None], shape)
     shuffled = jax.random.permutation(layer, numbers, independent=True)
     share = (shuffled + jax.random.uniform(place, shape, dtype)) / count
-    return params.low[None] + _span(params)[None] * share
+    return params.bounds[0][None] + _span(params)[None] * share
 
 
 def _fit(

@@ -15,7 +15,6 @@ from jaxtyping import Array, Float, PyTree
 from smoothdiff._samplers import AbstractSampler
 from smoothdiff._solvers import _newton_batches, _point_by_point
 from smoothdiff._solvers._base import check_settings, smoothed_params
-from smoothdiff._solvers._box import bounded
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._parameter_scan import Scan
 from smoothdiff._solvers._search_solver import AbstractSearchSolver
@@ -198,7 +197,7 @@ class NewtonCG(AbstractSearchSolver, optx.AbstractMinimiser):
         history = History.empty(length, n, 1, theta.dtype)
         width = jnp.ones((), theta.dtype)
         search = ValueSearch.of(params, theta, width, history)
-        if self.restarts and bounded(params):
+        if self.restarts and params.bounds is not None:
             scan = Scan.start(theta, jnp.zeros_like(width), params.sigma)
             search = dataclasses.replace(search, scan=scan)
         return _point_by_point.init(self, y, search, options, aux_struct)
