@@ -24,7 +24,7 @@ from smoothdiff._solvers._evaluator import Evaluator, objectives
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import Contest, Values, evaluated
 from smoothdiff._solvers._look import Look
-from smoothdiff._solvers._looking_search import AbstractLookingSearch
+from smoothdiff._solvers._point_search import AbstractPointSearch
 from smoothdiff._solvers._random_numbers import in_step, takes_key
 from smoothdiff._solvers._stages import Sizes
 from smoothdiff._solvers._where import where
@@ -45,7 +45,7 @@ class PointState(eqx.Module):
     """
 
     progress: Progress
-    search: AbstractLookingSearch
+    search: AbstractPointSearch
     restarts: Array
     found: History | None
     aux: PyTree[Array]
@@ -64,7 +64,7 @@ def patience(n: int, num_samples: int | None) -> int:
 def init(
     solver: Any,
     y: PyTree[Array],
-    search: AbstractLookingSearch,
+    search: AbstractPointSearch,
     options: dict[str, Any],
     aux_struct: PyTree,
 ) -> PointState:
@@ -126,13 +126,13 @@ class PointStep(eqx.Module):
         rows: Float[Array, "K P"],
         proposal: Any,
         stage: int | None = None,
-    ) -> AbstractLookingSearch:
+    ) -> AbstractPointSearch:
         """The search with what the function returned at these points."""
         new = self._new(points, rows)
         return self.state.search.after(self.params(), new, proposal, self.sizes, stage)
 
     def counted(
-        self, points: Float[Array, "K n"], rows: Float[Array, "K P"], after: AbstractLookingSearch
+        self, points: Float[Array, "K n"], rows: Float[Array, "K P"], after: AbstractPointSearch
     ) -> tuple[PyTree[Array], PointState]:
         """The iterate and the state with that search, or with another one if it is over."""
         solver, sizes, state, params = self.solver, self.sizes, self.state, self.params()
@@ -177,8 +177,8 @@ class PointStep(eqx.Module):
         return new_y, PointState(progress, after, restarts, found, state.aux)
 
     def _anew(
-        self, progress: Progress, before: AbstractLookingSearch
-    ) -> tuple[PyTree[Array], AbstractLookingSearch, History | None]:
+        self, progress: Progress, before: AbstractPointSearch
+    ) -> tuple[PyTree[Array], AbstractPointSearch, History | None]:
         """The iterate and the state of another search, and the history of the lowest before it."""
         params = self.params()
         lowest_theta = params.layout.vector(jax.tree.leaves(progress.lowest_y))
@@ -260,7 +260,7 @@ class PointStep(eqx.Module):
         return smoothed, unknown, Seen(y, jnp.full_like(unknown, jnp.inf))
 
 
-def _samples(solver: Any, key: Array, search: AbstractLookingSearch, count: int) -> Array:
+def _samples(solver: Any, key: Array, search: AbstractPointSearch, count: int) -> Array:
     """Standard normal points for a round."""
     return _normal_points(solver, jax.random.fold_in(key, search.seed()), count, search.start)
 

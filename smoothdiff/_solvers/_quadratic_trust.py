@@ -26,13 +26,13 @@ from smoothdiff._solvers._history import History
 from smoothdiff._solvers._least_change import least_change
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._model_check import check_step, is_right
-from smoothdiff._solvers._point_search import nothing
 from smoothdiff._solvers._ratio_test import (
     FEW,
     INSIDE,
     TELLING,
     asks_nothing,
     lost_in_rounding,
+    nothing,
     ratio_test,
     settled,
 )

@@ -11,7 +11,7 @@ from smoothdiff._params import Params
 from smoothdiff._solvers._averaging import apart
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._noisy_step import Trust, outcome, propose, revise
-from smoothdiff._solvers._point_search import nothing
+from smoothdiff._solvers._ratio_test import nothing
 from smoothdiff._solvers._scalar_fit import ScalarFit, fit
 from smoothdiff._solvers._stages import Sizes
 from smoothdiff._solvers._where import where
