@@ -72,16 +72,16 @@ def as_argnums(argnums: int | Sequence[int], num_args: int) -> tuple[int, ...]:
 class Params:
     """The arguments of one call, taken apart.
 
-    `theta`, `sigma`, `low` and `high` have one entry for each smoothed number. `free` holds the
-    leaves whose sigma is None. `sound` is False if traced arguments turn out invalid.
+    `theta`, `sigma` and both `bounds`, if there are any, have one entry for each smoothed number.
+    `free` holds the leaves whose sigma is None. `sound` is False if traced arguments turn out
+    invalid.
     """
 
     layout: Layout
     theta: Array
     sigma: Array
     sigma_traced: bool
-    low: Array | None
-    high: Array | None
+    bounds: tuple[Array, Array] | None
     sound: Array | None
     free: list[Array]
 
@@ -96,16 +96,14 @@ class Params:
 
     def clip(self, x: Array) -> Array:
         """The point that the function may see: within the bounds, if there are any."""
-        return x if self.low is None else jnp.clip(x, self.low, self.high)
+        return x if self.bounds is None else jnp.clip(x, *self.bounds)
 
     def reflected(self, x: Array) -> Array:
         """The sample that the function may see: reflected where a bound is crossed."""
-        if self.low is None or self.high is None:
-            return self.clip(x)
-        beyond = jnp.where(
-            x < self.low, 2 * self.low - x, jnp.where(x > self.high, 2 * self.high - x, x)
-        )
-        return self.clip(beyond)
+        if self.bounds is None:
+            return x
+        low, high = self.bounds
+        return self.clip(jnp.where(x < low, 2 * low - x, jnp.where(x > high, 2 * high - x, x)))
 
 
 def choose(args: tuple, argnums: int | Sequence[int]) -> PyTree:
@@ -159,7 +157,7 @@ def take_apart(target: PyTree, sigma: PyTree, bounds: tuple[PyTree, PyTree] | No
         for s, leaf in zip(sigmas, leaves, strict=True)
         if s is not None and not (is_concrete(s) and is_concrete(leaf))
     ]
-    low = high = None
+    sides = None
     if bounds is not None:
         check_pair(bounds)
         lows = side_leaves(bounds[0], -np.inf, target)
@@ -167,12 +165,12 @@ def take_apart(target: PyTree, sigma: PyTree, bounds: tuple[PyTree, PyTree] | No
         for lo, hi, leaf, name, keep in zip(lows, highs, leaves, names, smoothed, strict=True):
             if keep:
                 _check_bounds(lo, hi, leaf, name)
-        low, high = layout.vector(lows), layout.vector(highs)
+        low, high = sides = layout.vector(lows), layout.vector(highs)
         if not all(map(is_concrete, (low, high, theta))):
             checks.append(jnp.all((low <= theta) & (theta <= high)))
     sound = jnp.all(jnp.stack(checks)) if checks else None
     free = [leaf for leaf, keep in zip(leaves, smoothed, strict=True) if not keep]
-    return Params(layout, theta, width, sigma_traced, low, high, sound, free)
+    return Params(layout, theta, width, sigma_traced, sides, sound, free)
 
 
 def like(value: PyTree, target: PyTree, what: str) -> PyTree:

@@ -17,7 +17,7 @@ from smoothdiff._numbers import check_whole
 from smoothdiff._params import as_key
 from smoothdiff._solvers import AbstractSmoothSolver
 from smoothdiff._solvers._base import write_options
-from smoothdiff._solvers._box import bounds_of, has_box
+from smoothdiff._solvers._box import has_box
 from smoothdiff._solvers._stages import LOOK, TRUST
 from smoothdiff._told import Told
 
@@ -274,7 +274,7 @@ class Search:
         params = self._steps.parts(self._y, self._state).params()
         size = np.abs(point) + np.asarray(params.sigma)
         if self._state.search.stage == LOOK:
-            size += sum(np.abs(np.asarray(side)) for side in bounds_of(params))
+            size += sum(np.abs(np.asarray(side)) for side in params.bounds or ())
         away = {u: np.max(np.abs(came[0] - point) / size) for u, came in self._came.items()}
         nearest = min(away, key=away.__getitem__)
         return nearest if away[nearest] <= _ROUNDINGS * np.finfo(point.dtype).eps else None
@@ -294,11 +294,11 @@ class Search:
         # so wide that there are other points, where a radius has come to nothing
         least = np.sqrt(np.finfo(here.dtype).eps) * np.maximum(sigma, np.abs(here))
         width = np.maximum(sigma * np.asarray(search.width()), least)
-        box = bool(has_box(params))
+        box = params.bounds if has_box(params) else None
         for k in itertools.count():
             # whole numbers nearby may all be out
-            if box and k >= _NEARBY:
-                low, high = map(np.asarray, bounds_of(params))
+            if box is not None and k >= _NEARBY:
+                low, high = map(np.asarray, box)
                 point = self._random.uniform(low, high)
             else:
                 wider = max(1, k / _NEARBY)

@@ -292,7 +292,7 @@ def test_progress_records_the_best_of_the_finite_steps_and_the_lowest_of_all():
     for i, (fun, finite, value) in enumerate(steps):
         values = jnp.float32(fun), jnp.float32(0.1 * i), {"a": 0.5, "b": jnp.array([0.1, 0.7])}
         seen = Seen(jnp.full(1, 10.0 * i), jnp.float32(value))
-        progress = progress.after(jnp.full(1, i), *values, 10, jnp.asarray(finite), seen)
+        progress = progress.after(jnp.full(1, 1.0 * i), *values, 10, jnp.asarray(finite), seen)
     assert (progress.step, progress.evaluations) == (4, 40)
     assert (progress.smoothed, progress.sigma) == (2.5, jnp.float32(0.7))
     assert (progress.best_y, progress.best_smoothed) == (2, 2.0)

@@ -201,6 +201,16 @@ def test_bounds_far_away_change_nothing():
     assert took[0] == took[1] < 100
 
 
+def test_a_search_without_bounds_may_look_further_on():
+    """Where it went a million sigmas, whether it has run off is to be seen."""
+    search = sd.Search(jnp.zeros(1), key=jax.random.key(0), sigma=1e-6)
+    while not search.done and search.evaluations < 150:
+        points = search.ask(2)
+        search.tell(points, [(y[0] - 1) ** 2 for y in points])
+    assert search.done
+    assert search.y[0] == pytest.approx(1)
+
+
 @pytest.mark.slow
 def test_eight_points_of_each_round_are_as_good_as_num_samples(x64):
     """Ten evaluations determine a quadratic of three parameters."""

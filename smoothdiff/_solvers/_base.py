@@ -15,6 +15,7 @@ from smoothdiff._numbers import check_whole
 from smoothdiff._params import Params, as_key, take_apart
 from smoothdiff._seen import Seen
 from smoothdiff._solvers._stages import Sizes
+from smoothdiff._solvers._where import where
 
 # optax and norms mix dtypes (Adam raises a float to an integer), whatever the user's setting
 promotion = partial(jax.numpy_dtype_promotion, "standard")
@@ -88,15 +89,14 @@ class Progress(eqx.Module):
         dtype = self.smoothed.dtype
         smoothed, stderr = smoothed.astype(dtype), stderr.astype(dtype)
         widths = [jnp.max(jnp.asarray(s)).astype(dtype) for s in jax.tree.leaves(sigma)]
-        better = finite & (smoothed < self.best_smoothed)
-        best = (y, smoothed), (self.best_y, self.best_smoothed)
-        best_y, best_smoothed = jax.tree.map(lambda a, b: jnp.where(better, a, b), *best)
+        better, best = finite & (smoothed < self.best_smoothed), (self.best_y, self.best_smoothed)
+        best_y, best_smoothed = where(better, (y, smoothed), best)
         # of equals the last: on a plateau that is further from where the run came in. But the start
         # stays until something is lower: a function may be constant
         equal = (seen.value == self.lowest_fun) & ~self.at_start()
         lower = jnp.isfinite(seen.value) & ((seen.value < self.lowest_fun) | equal)
-        there = (seen.point, seen.value.astype(dtype)), (self.lowest_y, self.lowest_fun)
-        lowest_y, lowest_fun = jax.tree.map(lambda a, b: jnp.where(lower, a, b), *there)
+        there, before = (seen.point, seen.value.astype(dtype)), (self.lowest_y, self.lowest_fun)
+        lowest_y, lowest_fun = where(lower, there, before)
         return Progress(
             step=self.step + 1,
             evaluations=self.evaluations + evaluations,
@@ -129,9 +129,10 @@ def stopped(
     return enough | ~progress.finite, result
 
 
-def unless_failed(finite: Bool[Array, ""], new: PyTree, old: PyTree) -> PyTree:
-    """`new`; after a failed step `old`, so that the iterate can still be used."""
-    return jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, old)
+def is_small(solver: Any, move: PyTree[Array], y: PyTree[Array]) -> Bool[Array, ""]:
+    """Whether a step, or how wide one samples, is within the solver's tolerance at `y`."""
+    with promotion():
+        return solver.norm(move) < solver.atol + solver.rtol * solver.norm(y)
 
 
 def check_settings(solver: Any) -> None:

@@ -9,30 +9,31 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from smoothdiff._layout import layout_of
 from smoothdiff._params import Params
 from smoothdiff._samplers import Gaussian, Sobol
 from smoothdiff._seen import Seen, kept
 from smoothdiff._solvers._base import (
     Progress,
     all_finite,
-    promotion,
+    is_small,
     read_options,
     smoothed_params,
-    unless_failed,
 )
 from smoothdiff._solvers._batch_search import BatchSearch
 from smoothdiff._solvers._evaluator import Evaluator, half_squares
 from smoothdiff._solvers._history import History
-from smoothdiff._solvers._judgement import by_rows, judged, judging
+from smoothdiff._solvers._judgement import judging
 from smoothdiff._solvers._local_steps import TRIED, steps_to_try
 from smoothdiff._solvers._parameter_regression import gauss_newton_step
 from smoothdiff._solvers._random_numbers import in_step
 from smoothdiff._solvers._residual_batch import (
     ResidualBatch,
     around,
-    fresh_loss,
+    judge_rows,
 )
 from smoothdiff._solvers._restarts import Restarts
+from smoothdiff._solvers._where import where
 from smoothdiff._solvers._wide_rounds import LONGEST, further, next_scale, sides_of
 
 # evaluations a step of a problem with many parameters
@@ -76,6 +77,11 @@ def evaluations_per_step(solver: Any, y: PyTree[Array]) -> int:
 def final_evaluations(solver: Any, y: PyTree[Array]) -> int:
     """Those that judge the last iterate, and the start and the best estimate again."""
     return judging(evaluations_per_step(solver, y), new=1, old=2)
+
+
+def over(solver: Any, state: BatchState) -> Array:
+    """Whether the last steps were small."""
+    return state.search.converged()
 
 
 def _points(solver: Any, params: Params, key: Array, sigma: Array, count: int) -> Array:
@@ -139,7 +145,7 @@ def step(
     progress, search = state.progress, state.search
     params = smoothed_params(solver, y, progress.step, options)
     numbers = in_step(args, options, progress.step)
-    residuals = Evaluator(fn, numbers, params.layout, True, solver.batch_size, solver.sharding)
+    residuals = _evaluator(solver, fn, numbers, y)
     key = jax.random.fold_in(read_options(options)[0], progress.step)
     count, _, tried = sizes_of(solver, y)
     sigma = params.sigma * search.scale
@@ -174,12 +180,10 @@ def step(
 
     fun, stderr = batch.loss()
     new_y = params.layout.tree(theta)
-    with promotion():
-        moved = solver.norm(params.layout.tree(jnp.abs(theta - params.theta) + sigma))
-        small = moved < solver.atol + solver.rtol * solver.norm(y)
+    small = is_small(solver, params.layout.tree(jnp.abs(theta - params.theta) + sigma), y)
     finite = batch.enough(solver.nonfinite) & all_finite((fun, theta, scale))
     after = search.after(scale, history, theta - params.theta, ~same, fun, small)
-    new_y, after = unless_failed(finite, (new_y, after), (y, search))
+    new_y, after = where(finite, (new_y, after), (y, search))
     seen = Seen(params.layout.tree(point), there)
     rest = sigma, batch.count + tried, finite, seen, batch.overflowed
     progress = progress.after(y, fun, stderr, *rest)
@@ -199,25 +203,22 @@ def judge(
 ) -> tuple[PyTree[Array], dict[str, Array]]:
     """Judges all that was seen and the last iterate; with noise also the start and the best."""
     progress = state.progress
-    key = jax.random.fold_in(read_options(options)[0], progress.step)
     count = evaluations_per_step(solver, y)
     # with restarts, on the width on which the lowest estimate was made
     scale = state.search.scale if state.restarts is None else state.restarts.kernel
 
-    def estimate(y):
+    def samples(y: PyTree[Array], key: Array) -> Array:
         params = smoothed_params(solver, y, progress.step, options)
-        points = _points(solver, params, key, params.sigma * scale, count)
-        numbers = in_step(args, options, progress.step)
-        residuals = Evaluator(fn, numbers, params.layout, True, solver.batch_size, solver.sharding)
-        return fresh_loss(residuals, points, solver.nonfinite)
+        return _points(solver, params, key, params.sigma * scale, count)
 
-    params = smoothed_params(solver, y, progress.step, options)
-    values = by_rows(
-        Evaluator(fn, args, params.layout, True, solver.batch_size, solver.sharding), options
-    )
     # every iterate but the last was evaluated
-    old = progress.start_y, progress.best_y
-    return judged(progress, values, estimate, count, [y], old)
+    new, old = [y], (progress.start_y, progress.best_y)
+    evaluate = _evaluator(solver, fn, args, y)
+    return judge_rows(progress, evaluate, options, solver.nonfinite, samples, count, new, old)
+
+
+def _evaluator(solver: Any, fn: Any, args: PyTree, y: PyTree[Array]) -> Evaluator:
+    return Evaluator(fn, args, layout_of(y), True, solver.batch_size, solver.sharding)
 
 
 def _best(

@@ -12,30 +12,11 @@ from smoothdiff._params import Params
 _WIDTHS = 2.0
 
 
-def bounded(params: Params) -> bool:
-    """Whether there are bounds to both sides, open or not."""
-    return params.low is not None and params.high is not None
-
-
-def bounds_of(params: Params) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Those of parameters that are `bounded`.
-
-    Raises:
-        ValueError: they are not.
-    """
-    if params.low is None or params.high is None:
-        raise ValueError("this goes from bound to bound: give bounds")
-    return params.low, params.high
-
-
-def closed(params: Params) -> Bool[Array, ""]:
-    """Whether all of these bounds are finite."""
-    return jnp.all(jnp.isfinite(jnp.stack(bounds_of(params))))
-
-
 def has_box(params: Params) -> Bool[Array, ""]:
     """Whether all parameters have finite bounds."""
-    return closed(params) if bounded(params) else jnp.asarray(False)
+    if params.bounds is None:
+        return jnp.asarray(False)
+    return jnp.all(jnp.isfinite(jnp.stack(params.bounds)))
 
 
 def over_box(
@@ -52,12 +33,12 @@ def over_box(
         at: which of them are taken.
         otherwise: as many other points.
     """
-    if not bounded(params):
+    if params.bounds is None:
         return otherwise
-    low, high = bounds_of(params)
+    low, high = params.bounds
     z = draw()
     share = jax.scipy.special.ndtr(z)[jnp.minimum(at, len(z) - 1)]
-    return jnp.where(closed(params), low[None] + share * (high - low)[None], otherwise)
+    return jnp.where(has_box(params), low[None] + share * (high - low)[None], otherwise)
 
 
 def turned_inside(
@@ -77,11 +58,11 @@ def anywhere(params: Params, key: Array, lowest: Float[Array, " n"]) -> Float[Ar
     """A point within the bounds; without them, around the lowest so far at a random width."""
     key, other = jax.random.split(key)
     n, dtype = params.theta.size, params.theta.dtype
-    if params.low is not None and params.high is not None:
-        share = jax.random.uniform(key, (n,), dtype)
-        inside = params.low + share * (params.high - params.low)
-    else:
+    if params.bounds is None:
         inside = jnp.full(n, jnp.inf, dtype)
+    else:
+        low, high = params.bounds
+        inside = low + jax.random.uniform(key, (n,), dtype) * (high - low)
     power = jax.random.uniform(other, (), dtype, -_WIDTHS, _WIDTHS)
     around = lowest + params.sigma * 2.0**power * jax.random.normal(key, (n,), dtype)
     return params.clip(jnp.where(jnp.isfinite(inside), inside, around))

@@ -16,6 +16,7 @@ from smoothdiff._seen import Seen
 from smoothdiff._solvers._base import Progress
 from smoothdiff._solvers._evaluator import Evaluator
 from smoothdiff._solvers._random_numbers import in_round, takes_key
+from smoothdiff._solvers._where import where
 
 # how often each candidate is evaluated where the function is noisy
 _REPEATS = 3
@@ -90,7 +91,7 @@ class Contest(eqx.Module):
         smoothed, stderr, seen = estimate(y)
         last = seen.value.astype(found.dtype)
         lower = ~differs & (last < fun)
-        y, fun = jax.tree.map(lambda a, b: jnp.where(lower, a, b), (seen.point, last), (y, fun))
+        y, fun = where(lower, (seen.point, last), (y, fun))
         evaluations = self.progress.evaluations + self.each * done + batch
         return y, {"fun": fun, "smoothed": smoothed, "stderr": stderr, "evaluations": evaluations}
 

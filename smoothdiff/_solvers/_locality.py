@@ -14,7 +14,6 @@ from smoothdiff._estimate import combine
 from smoothdiff._named_baselines import as_baseline
 from smoothdiff._params import Params, is_concrete, take_apart
 from smoothdiff._samplers import AbstractSampler
-from smoothdiff._solvers._box import bounds_of
 from smoothdiff._stderr import value_stderr
 
 # the width of the smoothing kernel, in units of that of the locality
@@ -117,14 +116,15 @@ def log(values: Float[Array, " N"]) -> Float[Array, " N"]:
 
 def check_box(params: Params) -> None:
     """Raises ValueError unless there are bounds, and finite ones as far as can be told now."""
-    if params.low is None or params.high is None:
+    if params.bounds is None:
         raise ValueError("local=False samples all that is within the bounds: give bounds")
-    span = params.high - params.low
-    if is_concrete(span) and not np.all(np.isfinite(span)):
+    low, high = params.bounds
+    if is_concrete(span := high - low) and not np.all(np.isfinite(span)):
         raise ValueError("local=False samples all that is within the bounds: give finite bounds")
 
 
 def _within(params: Params, share_of: Array) -> Array:
     """The point at these shares of the way from the lower to the upper bounds."""
-    low, high = bounds_of(params)
+    assert params.bounds is not None
+    low, high = params.bounds
     return low + (high - low) * share_of

@@ -17,10 +17,9 @@ from smoothdiff._seen import watched
 from smoothdiff._solvers._base import (
     Progress,
     all_finite,
-    promotion,
+    is_small,
     read_options,
     smoothed_params,
-    unless_failed,
 )
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._judgement import judged, judging, one_by_one
@@ -29,6 +28,7 @@ from smoothdiff._solvers._random_numbers import in_step
 from smoothdiff._solvers._ratio_test import are_level
 from smoothdiff._solvers._regression_step import Center
 from smoothdiff._solvers._restarts import Restarts
+from smoothdiff._solvers._where import where
 from smoothdiff._stderr import value_stderr
 
 # the most entries of the points that are kept by default, 128 MB in float64
@@ -129,11 +129,6 @@ def step(
     values = batch.values.astype(points.dtype)
     history = state.history.after(points, values[:, None], values, good, jnp.asarray(len(z)))
 
-    def small(move: Array) -> Array:
-        with promotion():
-            length = solver.norm(params.layout.tree(move))
-            return length < solver.atol + solver.rtol * solver.norm(y)
-
     after, value, stderr = center.stepped(
         params,
         history.points,
@@ -142,11 +137,11 @@ def step(
         adaptive,
         returns=jnp.asarray(False),
         level=are_level(values, good),
-        small=small,
+        small=lambda move: is_small(solver, params.layout.tree(move), y),
     )
     new_y = params.layout.tree(after.theta)
     finite = all_finite((batch.values if batch.valid is None else batch.scale, after.theta))
-    going = unless_failed(finite, (new_y, after, history), (y, state.center, state.history))
+    going = where(finite, (new_y, after, history), (y, state.center, state.history))
     width = center.trust.width * metric.widest()
     progress = progress.after(y, value, stderr, width, len(z), finite, seen)
     restarts = state.restarts

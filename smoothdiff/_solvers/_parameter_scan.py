@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
-from smoothdiff._solvers._box import closed
+from smoothdiff._solvers._box import has_box
 from smoothdiff._solvers._where import where
 
 # evaluations along a parameter: in the try of the first parameters, in a first scan, and the most
@@ -75,7 +75,7 @@ class Scan(eqx.Module):
         done, made = self.done(), self.made()
         first, longer = Scan.start(base, fun, params.sigma), self.again(base, fun)
         scan = where(made, where(done, longer, self), first)
-        return scan, ~scan.failed & closed(params)
+        return scan, ~scan.failed & has_box(params)
 
     def propose(
         self, low: Float[Array, " n"], high: Float[Array, " n"], count: int

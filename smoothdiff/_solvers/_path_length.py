@@ -39,9 +39,10 @@ class PathLength(eqx.Module):
         least = _SPACINGS * spacing * jnp.max(jnp.abs(params.theta) / params.sigma)
         least = jnp.maximum(least, _LEAST)
         most = jnp.asarray(_MOST, self.scale.dtype)
-        if params.low is not None and params.high is not None:
+        if params.bounds is not None:
             # wider samples are clamped so often that their gradients agree on the bounds alone
-            span = params.high - params.low
+            low, high = params.bounds
+            span = high - low
             usual = jnp.min(jnp.where(span > 0, SIGMA * span / params.sigma, jnp.inf))
             most = jnp.clip(usual, 1, most)
         return jnp.clip(self.scale, jnp.minimum(least, most), most)
@@ -52,9 +53,10 @@ class PathLength(eqx.Module):
         rate = min(_SHORTEST, evaluations / n)
         slope = params.layout.vector(jax.tree.leaves(grad)) * params.sigma
         size = jnp.max(jnp.abs(slope))
-        if params.low is not None and params.high is not None:  # where the way is barred
-            low, high = params.theta <= params.low, params.theta >= params.high
-            slope = jnp.where((low & (slope > 0)) | (high & (slope < 0)), 0, slope)
+        if params.bounds is not None:  # where the way is barred
+            low, high = params.bounds
+            at_low, at_high = params.theta <= low, params.theta >= high
+            slope = jnp.where((at_low & (slope > 0)) | (at_high & (slope < 0)), 0, slope)
         free = slope / jnp.where(size > 0, size, 1)
         length = jnp.sqrt(jnp.sum(free**2))
         direction = free * math.sqrt(n) / jnp.where(length > 0, length, 1)

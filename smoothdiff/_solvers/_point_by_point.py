@@ -18,13 +18,13 @@ from smoothdiff._solvers._base import (
     read_options,
     smoothed_params,
 )
-from smoothdiff._solvers._box import anywhere, bounded
+from smoothdiff._solvers._box import anywhere
 from smoothdiff._solvers._convergence import signs
 from smoothdiff._solvers._evaluator import Evaluator, objectives
 from smoothdiff._solvers._history import History
-from smoothdiff._solvers._judgement import Contest, Values, evaluated, judging
+from smoothdiff._solvers._judgement import Contest, Values, evaluated
 from smoothdiff._solvers._look import Look
-from smoothdiff._solvers._looking_search import AbstractLookingSearch
+from smoothdiff._solvers._point_search import AbstractPointSearch
 from smoothdiff._solvers._random_numbers import in_step, takes_key
 from smoothdiff._solvers._stages import Sizes
 from smoothdiff._solvers._where import where
@@ -45,7 +45,7 @@ class PointState(eqx.Module):
     """
 
     progress: Progress
-    search: AbstractLookingSearch
+    search: AbstractPointSearch
     restarts: Array
     found: History | None
     aux: PyTree[Array]
@@ -61,18 +61,10 @@ def patience(n: int, num_samples: int | None) -> int:
     return max(_PATIENCE * (n + 1), _STEPS * (num_samples or 1))
 
 
-def final_evaluations(candidates: int) -> int:
-    """The best point again, and so many candidates of the search; with noise the start as well.
-
-    With a key there are up to three candidates in three rounds, which are fewer.
-    """
-    return judging(0, new=candidates, old=1)
-
-
 def init(
     solver: Any,
     y: PyTree[Array],
-    search: AbstractLookingSearch,
+    search: AbstractPointSearch,
     options: dict[str, Any],
     aux_struct: PyTree,
 ) -> PointState:
@@ -88,9 +80,7 @@ def init(
                 "function ends: call minimise from several starts instead"
             )
         search = search.averaging()
-    elif not solver.squares or bounded(
-        smoothed_params(solver, y, jnp.asarray(0, jnp.int32), options)
-    ):
+    elif not solver.squares or read_options(options)[1] is not None:
         search = dataclasses.replace(search, look=Look.start(search.start))
     if solver.sampler is not None:
         draw = lambda key: _normal_points(solver, key, 1, search.start)
@@ -136,13 +126,13 @@ class PointStep(eqx.Module):
         rows: Float[Array, "K P"],
         proposal: Any,
         stage: int | None = None,
-    ) -> AbstractLookingSearch:
+    ) -> AbstractPointSearch:
         """The search with what the function returned at these points."""
         new = self._new(points, rows)
         return self.state.search.after(self.params(), new, proposal, self.sizes, stage)
 
     def counted(
-        self, points: Float[Array, "K n"], rows: Float[Array, "K P"], after: AbstractLookingSearch
+        self, points: Float[Array, "K n"], rows: Float[Array, "K P"], after: AbstractPointSearch
     ) -> tuple[PyTree[Array], PointState]:
         """The iterate and the state with that search, or with another one if it is over."""
         solver, sizes, state, params = self.solver, self.sizes, self.state, self.params()
@@ -187,8 +177,8 @@ class PointStep(eqx.Module):
         return new_y, PointState(progress, after, restarts, found, state.aux)
 
     def _anew(
-        self, progress: Progress, before: AbstractLookingSearch
-    ) -> tuple[PyTree[Array], AbstractLookingSearch, History | None]:
+        self, progress: Progress, before: AbstractPointSearch
+    ) -> tuple[PyTree[Array], AbstractPointSearch, History | None]:
         """The iterate and the state of another search, and the history of the lowest before it."""
         params = self.params()
         lowest_theta = params.layout.vector(jax.tree.leaves(progress.lowest_y))
@@ -270,7 +260,7 @@ class PointStep(eqx.Module):
         return smoothed, unknown, Seen(y, jnp.full_like(unknown, jnp.inf))
 
 
-def _samples(solver: Any, key: Array, search: AbstractLookingSearch, count: int) -> Array:
+def _samples(solver: Any, key: Array, search: AbstractPointSearch, count: int) -> Array:
     """Standard normal points for a round."""
     return _normal_points(solver, jax.random.fold_in(key, search.seed()), count, search.start)
 

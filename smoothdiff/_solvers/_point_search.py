@@ -11,13 +11,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 from smoothdiff._params import Params
 from smoothdiff._solvers._averaging import Average
+from smoothdiff._solvers._box import has_box
 from smoothdiff._solvers._fall import Fall
 from smoothdiff._solvers._first_points import FirstPoints
 from smoothdiff._solvers._history import History, hardly_differ
 from smoothdiff._solvers._look import Look
 from smoothdiff._solvers._pilot import Pilot
-from smoothdiff._solvers._ratio_test import noticeable
+from smoothdiff._solvers._ratio_test import is_lower, noticeable
 from smoothdiff._solvers._stages import FIRST, LOOK, PILOT, TRUST, Sizes
+from smoothdiff._solvers._where import where
 
 # so many small steps in a row count as convergence
 _SMALL = 3
@@ -25,16 +27,15 @@ _SMALL = 3
 _COMING = 4
 # a step is nothing beside others below this share of the largest sigma
 _BESIDE = 1e-3
-# a width of so many roundings of sigma is nothing
-_NOTHING = 32
 
 
 class AbstractPointSearch(eqx.Module):
     """Where a search stands: all that was evaluated, and what comes next.
 
     It begins with the `first` points. Where they hardly differ, the `pilot` follows, and the first
-    points again if it found something else. There may be one `look`. `trust` has a local model, and
-    how far it is trusted.
+    points again if it found something else. There may be a `look` where little is left to do; where
+    it found a lower point the search begins anew. `trust` has a local model, and how far it is
+    trusted.
 
     `evaluated` counts the evaluations, `small` the small steps in a row. The `fall` says when the
     function last fell noticeably. There is an `average` if the function takes random numbers.
@@ -65,6 +66,14 @@ class AbstractPointSearch(eqx.Module):
 
         It has other random numbers.
         """
+
+    @abc.abstractmethod
+    def widened(self, params: Params, theta: Float[Array, " n"], width: Float[Array, ""]) -> Any:
+        """The same search before its first points, so many sigmas from a point that is known."""
+
+    @abc.abstractmethod
+    def elsewhere(self, params: Params, theta: Float[Array, " n"]) -> Any:
+        """Another such search before its first points, from a point that is known."""
 
     def width(self) -> Float[Array, " n"]:
         """How far from the iterate the function is looked at, relative to sigma."""
@@ -260,7 +269,66 @@ class AbstractPointSearch(eqx.Module):
         best, *_ = self.history.best(self.start)
         return best if self.average is None else self.average.over(best)
 
+    def piloting(self, params: Params) -> Any:
+        """With the pilot next, if the first points are over and all evaluations hardly differ."""
+        rows, valid = self.history.rows, self.history.valid
+        same = jnp.all(hardly_differ(rows, rows[jnp.argmax(valid)]) | ~valid)
+        stage = jnp.full_like(self.stage, PILOT)
+        flat = eqx.tree_at(lambda s: (s.stage, s.pilot.follows), self, (stage, self.stage))
+        return where(same & (self.stage != FIRST) & self.pilot.left(params), flat, self)
 
-def nothing(width: Float[Array, ""]) -> Bool[Array, ""]:
-    """Whether a width, relative to sigma, is so small that the function cannot be told apart."""
-    return width <= _NOTHING * jnp.finfo(width.dtype).eps
+    def piloted(self, params: Params, new: History) -> Any:
+        """After these points of the pilot: the first points again, or what would have followed."""
+        steps = (new.points - self.start[None]) / params.sigma[None]
+        known, box = jnp.argmax(self.history.valid), has_box(params)
+        changed = ~hardly_differ(new.rows, self.history.rows[known])
+        # in a box they go on until one is lower, whatever the others are
+        found = changed & (~box | (new.valid & (new.funs < self.history.funs[known])))
+        pilot = self.pilot.after(steps, found, new.valid | box)
+        stage = jnp.where(pilot.left(params), self.stage, pilot.follows)
+        more = eqx.tree_at(lambda s: (s.stage, s.pilot), self, (stage, pilot))
+        width = jnp.where(box, 1, pilot.length)
+        widened = more.widened(params, self.iterate(), width)
+        return where(pilot.length > 0, widened, more)
+
+    def looking(self, params: Params, sizes: Sizes, least: Bool[Array, ""]) -> Any:
+        """With a look over all of the box next, if one is due; not at the `least`.
+
+        Or with one further on, if it may have run off.
+        """
+        if (look := self.look) is None:
+            return self
+        due = self.look_due(params, sizes) & ~look.done & ~self.is_looking()
+        starts = due & ~least & ~self.is_good() & (has_box(params) | self.may_run_off(params))
+        stage = jnp.where(starts, LOOK, self.stage).astype(self.stage.dtype)
+        begun = look.begun(self.history.best(self.start)[2], self.stage)
+        done = eqx.tree_at(lambda k: k.done, look, look.done | due | least)
+        return eqx.tree_at(lambda s: (s.stage, s.look), self, (stage, where(starts, begun, done)))
+
+    def look_due(self, params: Params, sizes: Sizes) -> Bool[Array, ""]:
+        """Whether the search would end."""
+        return self.converged() | self.over(sizes)
+
+    def is_good(self) -> Bool[Array, ""]:
+        """Whether the lowest point is so low that no look is needed."""
+        return jnp.asarray(False)
+
+    def may_run_off(self, params: Params) -> Bool[Array, ""]:
+        """Whether it seems to have converged, and so far away that there may be no minimum."""
+        return jnp.asarray(False)
+
+    def looked(self) -> Bool[Array, ""]:
+        """Whether there is no look to come before the end."""
+        return jnp.asarray(True) if self.look is None else self.look.done
+
+    def after_look(self, params: Params, count: int) -> Any:
+        """After so many of its points: a new search where one is lower, or what would follow."""
+        assert self.look is not None
+        point, _, fun = self.history.best(self.start)
+        look = self.look.more(params, count)
+        stage = jnp.where(look.done, look.follows, self.stage)
+        more = eqx.tree_at(lambda s: (s.stage, s.look), self, (stage, look))
+        anew = dataclasses.replace(self.elsewhere(params, point), look=look.again())
+        # so far from the start, what is known of the function is that of other places
+        knows_little = self.may_run_off(params) & (look.found == 0)
+        return where(look.done & (is_lower(fun, look.before) | knows_little), anew, more)

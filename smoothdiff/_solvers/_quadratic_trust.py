@@ -26,13 +26,13 @@ from smoothdiff._solvers._history import History
 from smoothdiff._solvers._least_change import least_change
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._model_check import apart, check_step, is_right
-from smoothdiff._solvers._point_search import nothing
 from smoothdiff._solvers._ratio_test import (
     FEW,
     INSIDE,
     TELLING,
     asks_nothing,
     lost_in_rounding,
+    nothing,
     ratio_test,
     settled,
 )
@@ -224,13 +224,13 @@ class QuadraticTrust(eqx.Module):
         self, hessian: Array, grad: Array, radius: Array, center: Array, params: Params
     ) -> Array:
         """The minimiser within the radius that leaves no bound."""
-        if params.low is None or params.high is None:
+        if params.bounds is None:
             return bounded_step(hessian, grad, radius, None, None)
         # the bounds are those of the parameters, in units of sigma
         sigma = params.sigma
         units = self.metric.into(jnp.diag(sigma))
         bend, slope = dot(dot(units, hessian), units.T), dot(units, grad)
-        low, high = (params.low - center) / sigma, (params.high - center) / sigma
+        low, high = ((side - center) / sigma for side in params.bounds)
         step = bounded_step(bend, slope, radius, low, high, dot(units, units.T))
         return self.metric.into(params.clip(center + sigma * step) - center)
 

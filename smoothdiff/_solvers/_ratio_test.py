@@ -22,6 +22,8 @@ _RANGE = 5
 _PROGRESS = 1e-8
 # points are near each other within so many sigmas
 _NARROW = 1e-3
+# a width of so many roundings of sigma is nothing
+_NO_WIDTH = 32
 
 
 class Outcome(NamedTuple):
@@ -187,3 +189,8 @@ def asks_nothing(
     inside = jnp.linalg.norm(step) < INSIDE * radius
     done = little & (rise > TELLING * unit) & inside
     return Asked(little & ~done, done | ~(reduction > unit))
+
+
+def nothing(width: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether a width, relative to sigma, is so small that the function cannot be told apart."""
+    return width <= _NO_WIDTH * jnp.finfo(width.dtype).eps

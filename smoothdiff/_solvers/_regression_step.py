@@ -11,7 +11,7 @@ from smoothdiff._params import Params
 from smoothdiff._solvers._averaging import apart
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._noisy_step import Trust, outcome, propose, revise
-from smoothdiff._solvers._point_search import nothing
+from smoothdiff._solvers._ratio_test import nothing
 from smoothdiff._solvers._scalar_fit import ScalarFit, fit
 from smoothdiff._solvers._stages import Sizes
 from smoothdiff._solvers._where import where
@@ -144,15 +144,16 @@ def _bounded(
     params: Params, metric: Metric, base: Array, u: Array, width: Array, mirror: bool
 ) -> Array:
     """The point u widths from `base`, within the bounds if there are any."""
-    if params.low is None or params.high is None:
+    if params.bounds is None:
         return base + metric.out(width * u)
-    return metric.bounded(base, width * u, params.low, params.high, mirror)
+    return metric.bounded(base, width * u, *params.bounds, mirror)
 
 
 def _held(params: Params, x: Array, slope: Array, width: Array) -> Array | None:
     """Which parameters are at a bound that the descent would cross; None without bounds."""
-    if params.low is None or params.high is None:
+    if params.bounds is None:
         return None
+    low, high = params.bounds
     # a step to a bound ends there but for rounding
     near = 100 * jnp.finfo(x.dtype).eps * (jnp.abs(x) + width)
-    return ((x <= params.low + near) & (slope > 0)) | ((x >= params.high - near) & (slope < 0))
+    return ((x <= low + near) & (slope > 0)) | ((x >= high - near) & (slope < 0))

@@ -1,4 +1,8 @@
-"""Residuals at points around an iterate: where they are taken, what came, what counts."""
+"""Residuals at points around an iterate: where they are taken, what came, what they decide."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -9,7 +13,10 @@ from smoothdiff._draws import Draws
 from smoothdiff._params import Params
 from smoothdiff._samplers import AbstractSampler
 from smoothdiff._seen import Seen, kept, lowest
+from smoothdiff._solvers._base import Progress, read_options
 from smoothdiff._solvers._evaluator import Evaluator, half_squares
+from smoothdiff._solvers._judgement import by_rows, judged
+from smoothdiff._solvers._random_numbers import in_step
 
 
 class ResidualBatch(eqx.Module):
@@ -112,16 +119,31 @@ def check_terms(f_struct: PyTree, terms: jax.ShapeDtypeStruct) -> None:
         )
 
 
-def fresh_loss(
-    residuals: Evaluator, points: Float[Array, "m n"], nonfinite: str
-) -> tuple[Float[Array, ""], Float[Array, ""], Seen]:
-    """The smoothed loss by these points, its standard error, and the lowest of the points.
+def judge_rows(
+    progress: Progress,
+    evaluate: Evaluator,
+    options: dict[str, Any],
+    nonfinite: str,
+    samples: Callable[[PyTree[Array], Array], Float[Array, "m n"]],
+    count: int,
+    new: Sequence[PyTree[Array]],
+    old: Sequence[PyTree[Array]],
+) -> tuple[PyTree[Array], dict[str, Array]]:
+    """What `judged` gives where the function returns rows.
 
-    The loss is NaN if too few are good.
+    `samples` makes so many points around the answer, with a key, for its smoothed loss. That is NaN
+    if too few are good.
     """
-    rows, _ = residuals(points)
-    batch = ResidualBatch.of(points, rows, jnp.asarray(len(points)))
-    fun, stderr = batch.loss()
-    point, value = batch.lowest()
-    seen = Seen(residuals.layout.tree(point), value)
-    return jnp.where(batch.enough(nonfinite), fun, jnp.nan), stderr, seen
+    key = jax.random.fold_in(read_options(options)[0], progress.step)
+
+    def estimate(y: PyTree[Array]) -> tuple[Array, Array, Seen]:
+        points = samples(y, key)
+        numbers = in_step(evaluate.args, options, progress.step)
+        rows, _ = dataclasses.replace(evaluate, args=numbers)(points)
+        batch = ResidualBatch.of(points, rows, jnp.asarray(len(points)))
+        fun, stderr = batch.loss()
+        point, value = batch.lowest()
+        seen = Seen(evaluate.layout.tree(point), value)
+        return jnp.where(batch.enough(nonfinite), fun, jnp.nan), stderr, seen
+
+    return judged(progress, by_rows(evaluate, options), estimate, count, new, old)

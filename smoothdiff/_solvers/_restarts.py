@@ -1,9 +1,10 @@
 """Starting another search where one leads nowhere."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from smoothdiff._solvers._where import where
 
 
 class Restarts(eqx.Module):
@@ -25,13 +26,12 @@ class Restarts(eqx.Module):
 
     def after(self, lowest: Bool[Array, ""], kernel: PyTree[Array]) -> "Restarts":
         """Remembers how wide the batch was, if its estimate is the lowest so far."""
-        kernel = jax.tree.map(lambda a, b: jnp.where(lowest, a, b), kernel, self.kernel)
-        return Restarts(self.left, self.theta, kernel)
+        return Restarts(self.left, self.theta, where(lowest, kernel, self.kernel))
 
     def next(
         self, over: Bool[Array, ""], going: PyTree[Array], first: PyTree[Array]
     ) -> tuple[PyTree[Array], "Restarts"]:
         """What goes on, or if that is `over` and there is another search, what it begins with."""
         again = over & (self.left > 0)
-        going = jax.tree.map(lambda a, b: jnp.where(again, a, b), first, going)
-        return going, Restarts(self.left - again.astype(self.left.dtype), self.theta, self.kernel)
+        left = self.left - again.astype(self.left.dtype)
+        return where(again, first, going), Restarts(left, self.theta, self.kernel)

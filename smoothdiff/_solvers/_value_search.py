@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from smoothdiff._params import Params
 from smoothdiff._solvers._base import all_finite
-from smoothdiff._solvers._box import bounded, bounds_of, turned_inside
+from smoothdiff._solvers._box import turned_inside
 from smoothdiff._solvers._fall import Fall, much
 from smoothdiff._solvers._first_points import CARRIED, NEARER, FirstPoints, others_nearer
 from smoothdiff._solvers._history import History
@@ -79,8 +79,8 @@ class ValueSearch(ValueState):
             # a scan that is to come goes along all axes
             axes = self.scan is None
             branches.append(lambda: (look.points(params, best, draw, count, axes), nothing))
-        if (scan := self.scan) is not None:
-            branches.append(lambda: (scan.propose(*bounds_of(params), count), nothing))
+        if (scan := self.scan) is not None and (bounds := params.bounds) is not None:
+            branches.append(lambda: (scan.propose(*bounds, count), nothing))
         return by_stage(self.stage, stage, branches)
 
     def after(
@@ -99,7 +99,7 @@ class ValueSearch(ValueState):
         known = eqx.tree_at(lambda s: s.turn, known, self.turn.more(sizes.step))
 
         def fallen() -> Fall:
-            if self.look is None or not bounded(params):  # nobody asks
+            if self.look is None or params.bounds is None:  # nobody asks
                 return self.much
             fun = known.history.least()
             return self.much.after(fun, much(fun, known.history.usual()), sizes.step)

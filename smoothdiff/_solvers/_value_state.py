@@ -12,10 +12,10 @@ from smoothdiff._solvers._box import has_box
 from smoothdiff._solvers._fall import Fall
 from smoothdiff._solvers._first_points import FARTHER, NEARER, FirstPoints
 from smoothdiff._solvers._history import History
-from smoothdiff._solvers._looking_search import AbstractLookingSearch
 from smoothdiff._solvers._metric import Metric
 from smoothdiff._solvers._parameter_scan import Scan
 from smoothdiff._solvers._pilot import Pilot
+from smoothdiff._solvers._point_search import AbstractPointSearch
 from smoothdiff._solvers._quadratic_trust import QuadraticTrust
 from smoothdiff._solvers._ratio_test import is_narrow, rounding_alone
 from smoothdiff._solvers._regression_step import Center
@@ -37,7 +37,7 @@ _LEAST_NEAR = 0.25
 _NARROWEST, _WIDEST = -1.5, 0.3
 
 
-class ValueState(AbstractLookingSearch):
+class ValueState(AbstractPointSearch):
     """Where a search stands, with the local model and the center of the wide samples.
 
     `place` is where the local model was. Searches after the first, which `searches` counts, are the

@@ -218,7 +218,9 @@ def sides_of(
 ) -> tuple[Array | None, Array | None]:
     """The bounds as seen from a point, in units of sigma."""
     sigma = params.sigma if sigma is None else sigma
-    low, high = (None if s is None else (s - center) / sigma for s in (params.low, params.high))
+    if params.bounds is None:
+        return None, None
+    low, high = ((side - center) / sigma for side in params.bounds)
     return low, high
 
 

@@ -22,17 +22,18 @@ from smoothdiff._solvers._base import (
     Progress,
     all_finite,
     check_settings,
+    is_small,
     project,
     promotion,
     read_options,
     sigma_at,
     stopped,
-    unless_failed,
 )
 from smoothdiff._solvers._judgement import judged, judging, one_by_one
 from smoothdiff._solvers._optax import check_optax, updated
 from smoothdiff._solvers._path_length import PathLength, steps_scaled
 from smoothdiff._solvers._random_numbers import in_step
+from smoothdiff._solvers._where import where
 
 # so many small updates in a row count as convergence: under noise a single one is luck
 _PATIENCE = 5
@@ -206,9 +207,8 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
         average = jax.tree.map(
             lambda a, new: a + share.astype(a.dtype) * (new - a), state.average, new_y
         )
-        with promotion():
-            moved, size = self.norm(jax.tree.map(jnp.subtract, new_y, y)), self.norm(y)
-            stall = jnp.where(moved < self.atol + self.rtol * size, state.stall + 1, 0)
+        small = is_small(self, jax.tree.map(jnp.subtract, new_y, y), y)
+        stall = jnp.where(small, state.stall + 1, 0)
         finite = all_finite((fun, grad, new_y))
         length = after = None
         if state.length is not None:
@@ -216,7 +216,7 @@ class FirstOrder(AbstractSmoothSolver, optx.AbstractMinimiser):
                 state.length.after(params, grad, self.num_samples),
                 state.length.failed(),
             )
-        new_y, opt_state, average, length = unless_failed(
+        new_y, opt_state, average, length = where(
             finite,
             (new_y, opt_state, average, length),
             (y, state.opt_state, state.average, after),

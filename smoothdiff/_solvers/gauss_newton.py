@@ -3,31 +3,32 @@
 import math
 from collections.abc import Callable
 from dataclasses import KW_ONLY
+from types import ModuleType
 from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from smoothdiff._layout import layout_of
 from smoothdiff._samplers import AbstractSampler
 from smoothdiff._sharding import as_sharding
 from smoothdiff._solvers import _batch_by_batch, _point_by_point
-from smoothdiff._solvers._base import AbstractSmoothSolver, check_settings, smoothed_params, stopped
+from smoothdiff._solvers._base import check_settings, smoothed_params
 from smoothdiff._solvers._evaluator import Evaluator
 from smoothdiff._solvers._history import History
-from smoothdiff._solvers._judgement import by_rows
 from smoothdiff._solvers._residual_batch import check_residuals
 from smoothdiff._solvers._residual_search import ResidualSearch
+from smoothdiff._solvers._search_solver import AbstractSearchSolver
 from smoothdiff._solvers._stages import Sizes
 
 # the default patience of the only search is at least so much, as a plateau may be wide
 _LAST = 100
 
 
-class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
+class GaussNewton(AbstractSearchSolver, optx.AbstractLeastSquaresSolver):
     r"""Nonlinear least squares by Gauss-Newton, on residuals that need not be differentiable.
 
     $$ r(y_t + \sigma u) \approx r_t + J u, \qquad
@@ -166,6 +167,8 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     """
 
     squares: ClassVar[bool] = True
+    _batches: ClassVar[ModuleType] = _batch_by_batch
+    _candidates: ClassVar[int] = 0
 
     sigma: PyTree
     _: KW_ONLY
@@ -209,17 +212,6 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         patience = self.patience or max(usual, 0 if self.restarts else _LAST)
         return Sizes.of(self.num_samples, first, later, patience)
 
-    def evaluations_per_step(self, y: PyTree[Array]) -> int:
-        """One, or `num_samples`; with many parameters a batch and the steps that are tried."""
-        sizes = self.sizes(y)
-        return sizes.step if sizes else _batch_by_batch.evaluations_per_step(self, y)
-
-    def final_evaluations(self, y: PyTree[Array]) -> int:
-        """Those that judge the best point."""
-        if self.sizes(y):
-            return _point_by_point.final_evaluations(candidates=0)
-        return _batch_by_batch.final_evaluations(self, y)
-
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> Any:
         """Checks what can be looked at; evaluates nothing."""
         check_residuals(f_struct)
@@ -235,36 +227,9 @@ class GaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         search = ResidualSearch.of(theta, History.empty(length, n, size, theta.dtype))
         return _point_by_point.init(self, y, search, options, aux_struct)
 
-    def step(self, fn, y, args, options, state, tags):
-        """The next evaluations."""
-        sizes = self.sizes(y)
-        if sizes is None:
-            return _batch_by_batch.step(self, fn, y, args, options, state)
-        parts = _point_by_point.PointStep(self, sizes, y, options, state)
-        return parts.step(
-            Evaluator(fn, parts.numbers(args), layout_of(y), True, self.batch_size, self.sharding)
-        )
-
-    def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
-        """Where the last search leads nowhere any more, or after a failed step."""
-        sizes, converged = self.sizes(y), state.search.converged()
-        if sizes is None:
-            return stopped(state.progress, converged)
-        over = (state.restarts == 0) & state.search.over(sizes) & state.search.looked()
-        return stopped(state.progress, over, converged)
-
     def reason(self, state: Any) -> str:
         """Small steps, or too many evaluations that hardly lowered the loss."""
         return "converged" if state.search.converged() else "stalled"
 
-    def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        """Judges the best point, with noise beside others."""
-        sizes = self.sizes(y)
-        if sizes is None:
-            y, stats = _batch_by_batch.judge(self, fn, y, args, options, state)
-        else:
-            parts = _point_by_point.PointStep(self, sizes, y, options, state)
-            evaluate = Evaluator(fn, args, layout_of(y), True, self.batch_size, self.sharding)
-            y, stats = parts.judge(by_rows(evaluate, options))
-            aux = state.aux
-        return y, aux, stats
+    def _evaluator(self, fn: Any, args: PyTree, y: PyTree[Array]) -> Evaluator:
+        return Evaluator(fn, args, layout_of(y), True, self.batch_size, self.sharding)

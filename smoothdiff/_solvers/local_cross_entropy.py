@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from smoothdiff._layout import layout_of
 from smoothdiff._params import Params, is_concrete, take_apart
 from smoothdiff._samplers import Gaussian
 from smoothdiff._seen import Seen, kept
@@ -19,16 +20,16 @@ from smoothdiff._solvers._base import (
     Progress,
     all_finite,
     check_settings,
-    promotion,
+    is_small,
     read_options,
     stopped,
-    unless_failed,
 )
 from smoothdiff._solvers._evaluator import Evaluator
-from smoothdiff._solvers._judgement import by_rows, judged, judging
+from smoothdiff._solvers._judgement import judging
 from smoothdiff._solvers._local_ensemble import Blame
 from smoothdiff._solvers._random_numbers import in_step
-from smoothdiff._solvers._residual_batch import ResidualBatch, around, check_terms, fresh_loss
+from smoothdiff._solvers._residual_batch import ResidualBatch, around, check_terms, judge_rows
+from smoothdiff._solvers._where import where
 from smoothdiff._support import AbstractSupport, as_support
 
 # the share of a population that the next one is like, and the fewest of them that have a spread
@@ -207,12 +208,10 @@ class LocalCrossEntropy(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
         fun, stderr = population.loss()
 
         new_y = params.layout.tree(theta)
-        with promotion():
-            width = self.norm(params.layout.tree(wide))
-            narrow = width < self.atol + self.rtol * self.norm(new_y)
+        narrow = is_small(self, params.layout.tree(wide), new_y)
         small = jnp.where(narrow, state.small + 1, 0)
         finite = population.enough(self.nonfinite) & all_finite((fun, theta, wide))
-        new_y, wide = unless_failed(finite, (new_y, wide), (y, spread))
+        new_y, wide = where(finite, (new_y, wide), (y, spread))
         point, there = seen.lowest()
         # a population over the bounds says nothing of the function around the start
         fun = jnp.where(anywhere, jnp.nan, fun)
@@ -228,20 +227,17 @@ class LocalCrossEntropy(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         """Judges all that was seen and the last mean; with noise also the start and the best."""
         progress = state.progress
-        key = jax.random.fold_in(read_options(options)[0], progress.step)
-        params = self._params(y, options)
 
-        def estimate(y):
+        def samples(y: PyTree[Array], key: Array) -> Array:
             params = self._params(y, options)
-            points = around(params, Gaussian(), key, state.spread, self.num_samples)
-            numbers = in_step(args, options, progress.step)
-            residuals = Evaluator(fn, numbers, params.layout, True, self.batch_size)
-            return fresh_loss(residuals, points, self.nonfinite)
+            return around(params, Gaussian(), key, state.spread, self.num_samples)
 
-        values = by_rows(Evaluator(fn, args, params.layout, True, self.batch_size), options)
+        evaluate = Evaluator(fn, args, layout_of(y), True, self.batch_size)
         # every mean but the last was evaluated
-        old = progress.start_y, progress.best_y
-        y, stats = judged(progress, values, estimate, self.num_samples, [y], old)
+        new, old = [y], (progress.start_y, progress.best_y)
+        y, stats = judge_rows(
+            progress, evaluate, options, self.nonfinite, samples, self.num_samples, new, old
+        )
         return y, aux, stats
 
 
@@ -253,21 +249,22 @@ def _bounded(params: Params) -> bool:
 
 def _span(params: Params) -> Float[Array, " n"]:
     """How far apart the bounds are."""
-    if params.low is None or params.high is None:
+    if params.bounds is None:
         return jnp.full_like(params.theta, jnp.inf)
-    return params.high - params.low
+    low, high = params.bounds
+    return high - low
 
 
 def _even(params: Params, key: Array, count: int) -> Float[Array, "count n"]:
     """Points over the bounds, for each parameter one in each of so many equal parts."""
-    if params.low is None:
+    if params.bounds is None:
         return jnp.full((count, params.theta.size), jnp.nan, params.theta.dtype)
     layer, place = jax.random.split(key)
     shape, dtype = (count, params.theta.size), params.theta.dtype
     numbers = jnp.broadcast_to(jnp.arange(count, dtype=dtype)[:, None], shape)
     shuffled = jax.random.permutation(layer, numbers, independent=True)
     share = (shuffled + jax.random.uniform(place, shape, dtype)) / count
-    return params.low[None] + _span(params)[None] * share
+    return params.bounds[0][None] + _span(params)[None] * share
 
 
 def _fit(

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from smoothdiff._layout import layout_of
 from smoothdiff._params import Params
 from smoothdiff._samplers import AbstractSampler, Gaussian
 from smoothdiff._seen import Seen, kept
@@ -18,28 +19,28 @@ from smoothdiff._solvers._base import (
     Progress,
     all_finite,
     check_settings,
-    promotion,
+    is_small,
     read_options,
     smoothed_params,
     stopped,
-    unless_failed,
 )
 from smoothdiff._solvers._evaluator import Evaluator
-from smoothdiff._solvers._judgement import by_rows, judged, judging
+from smoothdiff._solvers._judgement import judging
 from smoothdiff._solvers._local_ensemble import (
     DAMPINGS,
     Blame,
     best_of_each_place,
     ensemble_steps,
 )
-from smoothdiff._solvers._random_numbers import in_step
+from smoothdiff._solvers._random_numbers import in_step, takes_key
 from smoothdiff._solvers._residual_batch import (
     ResidualBatch,
     around,
     centred,
     check_terms,
-    fresh_loss,
+    judge_rows,
 )
+from smoothdiff._solvers._where import where
 from smoothdiff._support import AbstractSupport, as_support
 
 # ends that are evaluated in a step: one for each damping, and the best of each place
@@ -209,11 +210,10 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
             wanted = jnp.where(worse, _SHRINK * scale, wider)
             scale = jnp.where(batch.same(), 2 * scale, wanted)
         new_y = params.layout.tree(theta)
-        with promotion():
-            moved = self.norm(params.layout.tree(jnp.abs(theta - params.theta) + sigma))
-            small = jnp.where(moved < self.atol + self.rtol * self.norm(y), state.small + 1, 0)
+        narrow = is_small(self, params.layout.tree(jnp.abs(theta - params.theta) + sigma), y)
+        small = jnp.where(narrow, state.small + 1, 0)
         finite = batch.enough(self.nonfinite) & all_finite((fun, theta, scale))
-        new_y, scale = unless_failed(finite, (new_y, scale), (y, state.scale))
+        new_y, scale = where(finite, (new_y, scale), (y, state.scale))
         point, there = batch.lowest()
         point, there = jnp.where(at_end < there, theta, point), jnp.minimum(there, at_end)
         seen = Seen(params.layout.tree(point), there)
@@ -228,23 +228,19 @@ class LocalGaussNewton(AbstractSmoothSolver, optx.AbstractLeastSquaresSolver):
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         """Judges all that was seen and the start; with noise also the last and the best iterate."""
         progress = state.progress
-        key = jax.random.fold_in(read_options(options)[0], progress.step)
 
-        def estimate(y):
+        def samples(y: PyTree[Array], key: Array) -> Array:
             params = smoothed_params(self, y, progress.step, options)
-            sigma = params.sigma * state.scale
-            points = around(params, self.sampler, key, sigma, self._samples(y))
-            numbers = in_step(args, options, progress.step)
-            residuals = Evaluator(fn, numbers, params.layout, True, self.batch_size)
-            return fresh_loss(residuals, points, self.nonfinite)
+            return around(params, self.sampler, key, params.sigma * state.scale, self._samples(y))
 
-        params = smoothed_params(self, y, progress.step, options)
-        values = by_rows(Evaluator(fn, args, params.layout, True, self.batch_size), options)
         # every iterate but the start is an end that was evaluated
         new, old = [progress.start_y], (y, progress.best_y)
-        if values.takes_key:
+        if takes_key(options):
             new, old = [y, *new], [progress.best_y]
-        y, stats = judged(progress, values, estimate, self._samples(y), new, old)
+        evaluate = Evaluator(fn, args, layout_of(y), True, self.batch_size)
+        y, stats = judge_rows(
+            progress, evaluate, options, self.nonfinite, samples, self._samples(y), new, old
+        )
         return y, aux, stats
 
 

@@ -4,22 +4,20 @@ import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import KW_ONLY
+from types import ModuleType
 from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
-from smoothdiff._layout import layout_of
 from smoothdiff._samplers import AbstractSampler
 from smoothdiff._solvers import _newton_batches, _point_by_point
-from smoothdiff._solvers._base import AbstractSmoothSolver, check_settings, smoothed_params, stopped
-from smoothdiff._solvers._box import bounded
-from smoothdiff._solvers._evaluator import Evaluator
+from smoothdiff._solvers._base import check_settings, smoothed_params
 from smoothdiff._solvers._history import History
-from smoothdiff._solvers._judgement import by_rows
 from smoothdiff._solvers._parameter_scan import Scan
+from smoothdiff._solvers._search_solver import AbstractSearchSolver
 from smoothdiff._solvers._stages import Sizes
 from smoothdiff._solvers._value_search import ValueSearch
 
@@ -29,7 +27,7 @@ _MANY = 100
 _FEW, _SOME = 4, 16
 
 
-class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
+class NewtonCG(AbstractSearchSolver, optx.AbstractMinimiser):
     r"""Newton's method on a black box that returns one number, from function values alone.
 
     $$ \min_p \; g \cdot p + \tfrac12 p \cdot H p, \qquad \|p\|_{M^{-1}} \le \Delta $$
@@ -155,6 +153,8 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
     """
 
     squares: ClassVar[bool] = False
+    _batches: ClassVar[ModuleType] = _newton_batches
+    _candidates: ClassVar[int] = 1
 
     sigma: PyTree
     _: KW_ONLY
@@ -186,17 +186,6 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         patience = self.patience or _point_by_point.patience(n, self.num_samples)
         return Sizes.of(self.num_samples, count, count, patience)
 
-    def evaluations_per_step(self, y: PyTree[Array]) -> int:
-        """One, or `num_samples`; with many parameters a batch."""
-        sizes = self.sizes(y)
-        return sizes.step if sizes else _newton_batches.evaluations_per_step(self, y)
-
-    def final_evaluations(self, y: PyTree[Array]) -> int:
-        """Those that judge the best point."""
-        if self.sizes(y):
-            return _point_by_point.final_evaluations(candidates=1)
-        return _newton_batches.final_evaluations(self, y)
-
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> Any:
         """Checks what can be looked at; evaluates nothing."""
         sizes = self.sizes(y)
@@ -210,28 +199,10 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         history = History.empty(length, n, 1, theta.dtype)
         width = jnp.ones((), theta.dtype)
         search = ValueSearch.of(params, theta, width, history)
-        if self.restarts and bounded(params):
+        if self.restarts and params.bounds is not None:
             scan = Scan.start(theta, jnp.zeros_like(width), params.sigma)
             search = dataclasses.replace(search, scan=scan)
         return _point_by_point.init(self, y, search, options, aux_struct)
-
-    def step(self, fn, y, args, options, state, tags):
-        """The next evaluations."""
-        sizes = self.sizes(y)
-        if sizes is None:
-            return _newton_batches.step(self, fn, y, args, options, state)
-        parts = _point_by_point.PointStep(self, sizes, y, options, state)
-        return parts.step(Evaluator(fn, parts.numbers(args), layout_of(y), False, None))
-
-    def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
-        """Where the last search leads nowhere any more, or after a failed step."""
-        sizes = self.sizes(y)
-        if sizes is None:
-            return stopped(state.progress, _newton_batches.over(self, state))
-        converged = state.search.converged()
-        over = (state.restarts == 0) & (converged | state.search.over(sizes))
-        over &= state.search.looked()
-        return stopped(state.progress, over, converged)
 
     def reason(self, state: Any) -> str:
         """Small steps, a gradient that is all noise, or too many evaluations for nothing.
@@ -245,15 +216,3 @@ class NewtonCG(AbstractSmoothSolver, optx.AbstractMinimiser):
         search = state.search
         noisy = search.noisy | (search.average is not None)
         return "noise" if search.center.trust.insignificant & noisy else "stalled"
-
-    def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        """Judges the best point, with noise beside others."""
-        sizes = self.sizes(y)
-        if sizes is None:
-            y, stats = _newton_batches.judge(self, fn, y, args, options, state)
-        else:
-            parts = _point_by_point.PointStep(self, sizes, y, options, state)
-            evaluate = Evaluator(fn, args, layout_of(y), False, None)
-            y, stats = parts.judge(by_rows(evaluate, options))
-            aux = state.aux
-        return y, aux, stats

@@ -19,12 +19,11 @@ from smoothdiff._solvers._base import (
     Progress,
     all_finite,
     check_settings,
-    promotion,
+    is_small,
     read_options,
     sigma_at,
     smoothed_params,
     stopped,
-    unless_failed,
 )
 from smoothdiff._solvers._descent import as_optimizer, descended
 from smoothdiff._solvers._judgement import judged, judging, one_by_one
@@ -33,6 +32,7 @@ from smoothdiff._solvers._optax import check_optax
 from smoothdiff._solvers._random_numbers import in_step
 from smoothdiff._solvers._replay import Replay
 from smoothdiff._solvers._surrogate_fit import Fit, Settings
+from smoothdiff._solvers._where import where
 from smoothdiff.surrogates import MLP
 
 # so many small updates in a row count as convergence, as in FirstOrder
@@ -266,12 +266,11 @@ class ZeroGrads(AbstractSmoothSolver, optx.AbstractMinimiser):
             read_options(options)[1],
             length=self.parameter_steps,
         )
-        with promotion():
-            moved, length = self.norm(jax.tree.map(jnp.subtract, new_y, y)), self.norm(y)
-            stall = jnp.where(moved < self.atol + self.rtol * length, state.stall + 1, 0)
+        small = is_small(self, jax.tree.map(jnp.subtract, new_y, y), y)
+        stall = jnp.where(small, state.stall + 1, 0)
         finite = all_finite((fit.weights, fit.spread, new_y))
         new, old = (new_y, fit, opt_state), (y, state.fit, state.opt_state)
-        new_y, fit, opt_state = unless_failed(finite, new, old)
+        new_y, fit, opt_state = where(finite, new, old)
         fun, stderr = locality.mean(batch)
         sigma = sigma_at(self.sigma, progress.step)
         progress = progress.after(y, fun, stderr, sigma, self.num_samples, finite, seen)
