@@ -57,6 +57,16 @@ def test_a_poor_minimum_is_left(case, seed):
     np.testing.assert_allclose(left.y, BASIN, atol=1e-3)
 
 
+def test_of_one_parameter_the_lowest_of_many_valleys_is_found():
+    valleys = lambda y, at: 2 * (y - at) ** 2 + 0.5 * (1 - jnp.cos(15 * (y - at)))
+    evaluations = []
+    for seed, (start, at) in enumerate(np.random.default_rng(0).uniform(0.05, 0.95, (20, 2))):
+        result = sd.minimise(valleys, start, at, key=jax.random.key(seed), bounds=(0.0, 1.0))
+        np.testing.assert_allclose(result.y, at, atol=0.01)
+        evaluations.append(result.evaluations)
+    assert np.median(evaluations) < 60
+
+
 @pytest.mark.parametrize("seed", quick_of(range(5), [0]))
 def test_a_minimum_with_a_kink_is_left(seed):
     """Wide samples around it find nothing: the look comes while they still go on."""
@@ -195,15 +205,15 @@ def left_over(y):
 
 bowl = lambda y: jnp.sum((y - BASIN) ** 2)
 ENDS = [
-    (sd.minimise, sd.NewtonCG, bowl, 5),
-    (sd.least_squares, sd.GaussNewton, left_over, 5),
+    (sd.minimise, sd.NewtonCG, bowl, 9),
+    (sd.least_squares, sd.GaussNewton, left_over, 9),
     (sd.least_squares, sd.GaussNewton, lambda y: y - BASIN, 0),
 ]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("end", range(3), ids=["number", "much", "none"])
-def test_a_good_minimum_costs_two_points_a_parameter_and_one(end):
+def test_a_good_minimum_costs_a_few_points(end):
     call, solver, fun, more = ENDS[end]
     runs = []
     for bounds in ((-jnp.inf, jnp.inf), (LOW, HIGH)):
@@ -326,11 +336,11 @@ def test_a_minimum_far_away_is_found_and_looked_beyond():
 
 def test_the_last_points_change_one_parameter_each():
     params = take_apart(jnp.zeros(3), 1.0, (-1.0, 1.0))
-    best, samples = jnp.array([0.5, -0.25, 0.125]), jax.random.normal(jax.random.key(0), (7, 3))
+    best, samples = jnp.array([0.5, -0.25, 0.125]), jax.random.normal(jax.random.key(0), (10, 3))
     look = Look.start(best)
     # more are asked for than there are
-    points = np.asarray(jax.jit(lambda: look.points(params, best, lambda count: samples, 8))())
+    points = np.asarray(jax.jit(lambda: look.points(params, best, lambda count: samples, 11))())
     changed = points != np.asarray(best)
-    assert np.all(np.sum(changed[:4], axis=1) == 3)
-    np.testing.assert_array_equal(changed[4:7], np.eye(3, dtype=bool))
-    np.testing.assert_array_equal(points[7], points[6])
+    assert np.all(np.sum(changed[:7], axis=1) == 3)
+    np.testing.assert_array_equal(changed[7:10], np.eye(3, dtype=bool))
+    np.testing.assert_array_equal(points[10], points[9])

@@ -3,7 +3,8 @@
 A search knows a neighbourhood. Where it is in a minimum of little depth, a few points anywhere
 are mostly lower; where it found a good one, they cost no more than a first quadratic model. The
 last of them differ from the best point in one parameter each: one that jumps may be wrong where
-the others are so right that no point anywhere is lower.
+the others are so right that no point anywhere is lower. Of few parameters a box is soon seen, and
+points are as many as find most of what is in it.
 
 Where there is no box a search may run off. So far from the start that steps beside the distance are
 small, and differences of values are rounding, it seems to have converged. A point twice as far away
@@ -24,6 +25,8 @@ from smoothdiff._solvers._box import has_box, over_box
 _SEEDS = 2**16
 # a search that goes so many sigmas has run off, or began with far too few: its end may be rounding
 _FAR = 1e5
+# of few parameters so many points are spread over the box
+_FEWEST = 7
 
 
 class Look(eqx.Module):
@@ -49,8 +52,13 @@ class Look(eqx.Module):
 
     @staticmethod
     def length(n: int) -> int:
-        """How many points a box takes, of n parameters: as many as a first quadratic model."""
-        return 2 * n + 1
+        """How many points a box takes, of n parameters."""
+        return n + Look.spread(n)
+
+    @staticmethod
+    def spread(n: int) -> int:
+        """How many of them are spread over all of it."""
+        return max(n + 1, _FEWEST)
 
     def is_far(self, params: Params, point: Float[Array, " n"]) -> Bool[Array, ""]:
         """Whether a search may have run off to this point."""
@@ -99,8 +107,9 @@ class Look(eqx.Module):
         times = (1 + at).astype(best.dtype)[:, None]
         further = best[None] + times * (best - self.origin)[None]
         points = over_box(params, lambda: draw(self.length(n)), at, further)
-        along = jax.nn.one_hot(jnp.minimum(at, 2 * n) - n - 1, n, dtype=bool)
-        others = has_box(params) & axes & (at > n)[:, None] & ~along
+        first = self.spread(n)
+        along = jax.nn.one_hot(jnp.minimum(at - first, n - 1), n, dtype=bool)
+        others = has_box(params) & axes & (at >= first)[:, None] & ~along
         return jnp.where(others, best[None], points)
 
     def seed(self, looking: Bool[Array, ""]) -> Int[Array, ""]:

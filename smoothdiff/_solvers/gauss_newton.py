@@ -76,9 +76,9 @@ class GaussNewton(AbstractSearchSolver, optx.AbstractLeastSquaresSolver):
     width are then halved.
 
     Within finite bounds a search that would end with more than a tenth of the loss of its start
-    looks at n + 1 points spread over all of the box, and at n that differ from the best one in one
-    parameter each. Where one is lower, it begins anew. A value that is not finite ends nothing
-    there. Searches that `restarts` add do not look.
+    looks at n + 1 points, but no fewer than 7, spread over all of the box, and at n that differ
+    from the best one in one parameter each. Where one is lower, it begins anew. A value that is not
+    finite ends nothing there. Searches that `restarts` add do not look.
 
     With 100 parameters and more, or with a schedule of sigma, each step takes a batch, and there is
     the wide regression alone. A batch may say little about each of so many parameters. Then 12 of
