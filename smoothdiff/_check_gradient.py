@@ -128,6 +128,7 @@ def check_gradient(
     Raises:
         ValueError: too few samples, a gradient of another structure or shape than y, a value that
             is not finite.
+        TypeError: `num_samples` is no whole number.
 
     Example:
         >>> import jax, jax.numpy as jnp, smoothdiff as sd

@@ -73,7 +73,8 @@ def ctrl_c_noticed() -> Iterator[None]:
     something else.
 
     A run may be part of an evaluation of another run, in whatever thread. Then it raises
-    KeyboardInterrupt in place of what it found, as that other run must not take it for a value.
+    KeyboardInterrupt in place of what it found, as that other run must not take it for a value. A
+    run in a thread beside the main thread's is taken for such a part.
     """
     alone = threading.current_thread() is threading.main_thread()
     if not alone or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:

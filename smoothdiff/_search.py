@@ -274,7 +274,8 @@ class Search:
         params = self._steps.parts(self._y, self._state).params()
         size = np.abs(point) + np.asarray(params.sigma)
         if self._state.search.stage == LOOK:
-            size += sum(np.abs(np.asarray(side)) for side in params.bounds or ())
+            for side in params.bounds or ():
+                size += np.where(np.isfinite(side), np.abs(side), 0)
         away = {u: np.max(np.abs(came[0] - point) / size) for u, came in self._came.items()}
         nearest = min(away, key=away.__getitem__)
         return nearest if away[nearest] <= _ROUNDINGS * np.finfo(point.dtype).eps else None

@@ -244,6 +244,8 @@ def test_integers_that_are_not_smoothed_have_no_derivative(transform):
     p = {"a": X, "b": jnp.array(1)}
     with pytest.raises(TypeError, match=r"int32 has no derivative: make it another argument"):
         transform(tree_fun, NONE)(KEY, p)
+    with pytest.raises(TypeError, match=r"int32 has no derivative: make it another argument"):
+        sd.smooth_hvp(tree_fun, NONE)(KEY, p, p)
 
 
 def test_the_same_messages_from_every_transform():

@@ -13,7 +13,7 @@ from smoothdiff._params import take_apart
 from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._least_change import least_change
-from smoothdiff._solvers._model_check import apart
+from smoothdiff._solvers._model_check import to_new_place
 from smoothdiff._solvers._quadratic_trust import QuadraticTrust
 
 N = 3
@@ -288,6 +288,15 @@ def test_points_that_do_not_determine_a_quadratic_are_not_met_exactly(x64):
 
 
 def test_a_check_is_at_no_known_point():
-    known = jnp.asarray([[0.0, 0.0], [1.0, 0.05], [0.5, 0.0]])
-    np.testing.assert_array_equal(apart(jnp.asarray([1.0, 0.0]), known), [0.25, 0.0])
-    np.testing.assert_array_equal(apart(jnp.asarray([0.0, 1.0]), known), [0.0, 1.0])
+    known = jnp.asarray([[0.0, 0.0], [1.0, 0.05], [-1.0, 0.0], [0.5, 0.0]])
+    ends = jnp.asarray([[1.0, 0.0], [-1.0, 0.0]])
+    rise = lambda steps: jnp.sum(steps**2, axis=1)
+    place = lambda known, least: to_new_place(ends, known, rise, jnp.asarray(least))
+    # the opposite comes before a half, of which a quarter must be more than rounding
+    np.testing.assert_array_equal(place(known[:2], 0.0), [-1, 0])
+    np.testing.assert_array_equal(place(known, 0.0), [-0.5, 0])
+    np.testing.assert_array_equal(place(known, 0.5), [1, 0])
+    # the farthest, where all are known
+    steps = [2.0**-k * end for k in range(4) for end in ends]
+    shifted = jnp.stack([step * (1.01 if k < 7 else 1.09) for k, step in enumerate(steps)])
+    np.testing.assert_array_equal(place(shifted, 0.0), steps[7])

@@ -201,10 +201,15 @@ def test_bounds_far_away_change_nothing():
     assert took[0] == took[1] < 100
 
 
-def test_a_search_without_bounds_may_look_further_on():
+@pytest.mark.parametrize("bounds", [None, (0.0, np.inf)])
+def test_a_search_without_a_box_may_look_further_on(bounds):
     """Where it went a million sigmas, whether it has run off is to be seen."""
-    search = sd.Search(jnp.zeros(1), key=jax.random.key(0), sigma=1e-6)
+    search = sd.Search(jnp.zeros(1), key=jax.random.key(0), sigma=1e-6, bounds=bounds)
+    looked = lambda: search._state.search.is_looking()
     while not search.done and search.evaluations < 150:
+        if looked():  # a point that nobody asked for is not the one that the look wants
+            search.tell([np.array([0.123])], [(0.123 - 1) ** 2])
+            assert looked()
         points = search.ask(2)
         search.tell(points, [(y[0] - 1) ** 2 for y in points])
     assert search.done

@@ -10,6 +10,7 @@ from scipy.optimize import minimize
 
 import smoothdiff as sd
 from smoothdiff._params import take_apart
+from smoothdiff._solvers._box import turned_inside
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._ratio_test import is_lower, rounding_alone
 from smoothdiff._solvers._residual_search import ResidualSearch
@@ -280,3 +281,18 @@ def test_a_start_on_a_bound_is_not_taken_for_a_minimum_nearby(n, at):
             result = sd.minimise(fun, start, least, key=KEY, bounds=(0.0, 1.0), max_evaluations=400)
             high, low = fun(start, least), fun(start + (1 - 2 * at) * least, least)
             assert float((result.fun - low) / (high - low)) < 1e-3, (fun, c)
+
+
+def test_a_first_point_that_a_bound_cuts_off_is_half_as_far_on_the_other_side():
+    def ends(start, sigma):
+        params = take_apart(jnp.asarray([start]), sigma, (0.0, 1.0))
+        steps = sigma * jnp.asarray([[1.0], [-1.0]])
+        return jax.jit(lambda: turned_inside(params, jnp.asarray([start]), steps))()[:, 0].tolist()
+
+    assert ends(0.5, 0.25) == [0.75, 0.25]
+    assert ends(0.0, 0.25) == [0.25, 0.125]
+    assert ends(1.0, 0.25) == [0.875, 0.75]
+    # where a box is narrow beside sigma both ends are seen from its middle
+    assert ends(0.5, 2.0) == [1.0, 0.0]
+    assert ends(0.4375, 2.0) == [1.0, 0.0]
+    assert ends(0.25, 2.0) == [1.0, 0.625]

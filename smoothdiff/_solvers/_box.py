@@ -50,8 +50,7 @@ def turned_inside(
     """
     ends, opposite = (jax.vmap(params.clip)(start[None] + s) for s in (steps, -steps))
     room, beyond = (jnp.abs(end - start[None]) for end in (ends, opposite))
-    cut = (room < jnp.abs(steps) / 2) & (room < beyond)
-    return jnp.where(cut, (start[None] + opposite) / 2, ends)
+    return jnp.where(room < beyond / 2, (start[None] + opposite) / 2, ends)
 
 
 def anywhere(params: Params, key: Array, lowest: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -9,6 +9,8 @@ the gradient moves the minimum most there, unless a point about as near is known
 Source: our own; the criticality step of Conn, Scheinberg and Vicente 2009 has the same purpose.
 """
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -22,8 +24,8 @@ from smoothdiff._solvers._ratio_test import TELLING
 _STEPS = 10.0
 # a rise that is so many times higher or lower than predicted is right
 _RIGHT = 2.0
-# a point that is nearer to a known one than this share of its way is the same, and half the way is
-# tried, so often
+# a point that is nearer to a known one than this share of its way is the same; of a way so many
+# lengths are tried, each half of the one before
 _KNOWN, _HALVES = 0.1, 4
 
 
@@ -65,17 +67,34 @@ def check_step(
     return jnp.minimum(jnp.maximum(length, far_enough(curvature)), radius) * direction
 
 
-def apart(step: Float[Array, " n"], known: Float[Array, "m n"]) -> Float[Array, " n"]:
-    """So much of a step that its end is at no known point: of these any model is right.
+def to_new_place(
+    ends: Float[Array, "k n"],
+    known: Float[Array, "m n"],
+    rise: Callable[[Float[Array, "K n"]], Float[Array, " K"]],
+    least: Float[Array, ""],
+) -> Float[Array, " n"]:
+    """The first of these checks that ends at no known point, as of those any model is right.
+
+    Where all do, halves of them follow; the last resort is the one that is farthest from all.
 
     Args:
-        step: from the center to the check.
+        ends: from the center to a check.
         known: the points, seen from there.
+        rise: what the model predicts at the end of steps.
+        least: a half must rise by as much to tell anything.
     """
-    ends = step[None] * 2.0 ** -jnp.arange(_HALVES, dtype=step.dtype)[:, None]
-    gaps = jnp.min(jnp.linalg.norm(ends[:, None] - known[None], axis=2), axis=1)
-    new = gaps > _KNOWN * jnp.linalg.norm(ends, axis=1)
-    return ends[jnp.argmax(new)]
+    halves = 2.0 ** -jnp.arange(_HALVES, dtype=ends.dtype)
+    steps = (halves[:, None, None] * ends[None]).reshape(-1, ends.shape[1])
+    tells = (jnp.arange(len(steps)) < len(ends)) | (rise(steps) > least)
+    length = jnp.maximum(jnp.linalg.norm(steps, axis=1), jnp.finfo(ends.dtype).tiny)
+    gaps = jnp.min(jnp.linalg.norm(steps[:, None] - known[None], axis=2), axis=1) / length
+    new, farthest = tells & (gaps > _KNOWN), jnp.argmax(jnp.where(tells, gaps, -1))
+    return steps[jnp.where(jnp.any(new), jnp.argmax(new), farthest)]
+
+
+def least_rise(fun: Float[Array, ""]) -> Float[Array, ""]:
+    """A check that rises by more than this tells something."""
+    return TELLING / 2 * jnp.finfo(fun.dtype).eps * jnp.abs(fun)
 
 
 def is_right(
@@ -89,4 +108,4 @@ def is_right(
         rise: by how much that is higher, as the model predicts.
     """
     about = (fun - before > rise / _RIGHT) & (fun - before < rise * _RIGHT)
-    return about & (rise > TELLING / 2 * jnp.finfo(fun.dtype).eps * jnp.abs(before))
+    return about & (rise > least_rise(before))

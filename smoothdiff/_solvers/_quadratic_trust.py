@@ -25,7 +25,7 @@ from smoothdiff._solvers._bounded_step import bounded_step
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._least_change import least_change
 from smoothdiff._solvers._metric import Metric
-from smoothdiff._solvers._model_check import apart, check_step, is_right
+from smoothdiff._solvers._model_check import check_step, is_right, least_rise, to_new_place
 from smoothdiff._solvers._ratio_test import (
     FEW,
     INSIDE,
@@ -191,14 +191,15 @@ class QuadraticTrust(eqx.Module):
             return ends[jnp.argmax(jnp.abs(constant + change(ends, slope, bend)))]
 
         def checked() -> Array:
-            """One of the two ends of a check, within the bounds: the lower one."""
+            """One of the two ends of a check, within the bounds: the lower one, if it is new."""
             check = check_step(model, self.metric, center, fun, steps[0], self.radius)
-            ends = jnp.stack([check, -check])
-            ends = inside(ends)
+            ends = inside(jnp.stack([check, -check]))
             length = jnp.linalg.norm(ends, axis=1)
             short = length < jnp.max(length) / 2
-            lower = ends[jnp.argmin(jnp.where(short, jnp.inf, change(ends, grad, hessian)))]
-            return apart(lower, model.away)
+            ends = jnp.where(short[:, None], ends[::-1], ends)
+            rise = lambda steps: change(steps, grad, hessian)
+            ends = ends[jnp.argsort(rise(ends))]
+            return to_new_place(ends, model.away, rise, least_rise(fun))
 
         which = jnp.where(check, 2, self.improve.astype(jnp.int32))
         first = jax.lax.switch(which, [lambda: steps[0], other, checked])

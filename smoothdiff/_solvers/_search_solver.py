@@ -17,7 +17,7 @@ class AbstractSearchSolver(AbstractSmoothSolver):
     """What `GaussNewton` and `NewtonCG` share; by batches where there are no `sizes`.
 
     The `squares` of what the function returns are minimised, or itself. `_batches` has the steps
-    of batches. With noise so many `_candidates` of a search are judged beside the best point.
+    of batches. So many `_candidates` of a search are judged beside the best point.
     """
 
     squares: ClassVar[bool]

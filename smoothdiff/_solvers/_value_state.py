@@ -156,7 +156,7 @@ class ValueState(AbstractPointSearch):
         r"""How far each parameter's first points should have been, as a share of how far they are.
 
         Where both are higher than the start, the parabola through all three is lowest at s, in
-        units of how far they are, and four times as far is enough:
+        units of how far they are, and four times as far is enough. With one to each side:
 
         $$ 4 |s|, \quad s = \frac{f_- - f_+}{2 (f_+ + f_- - 2 f_0)} $$
         """
@@ -166,7 +166,7 @@ class ValueState(AbstractPointSearch):
         rise = jnp.where(alone, (history.funs - history.funs[here])[:, None], 0)
         higher = (jnp.sum(alone, axis=0) == SIDES) & jnp.all(~alone | (rise > 0), axis=0)
         higher &= history.valid[here] & jnp.all(history.points[here] == self.start)
-        # each in units of the largest, as powers might overflow; bounds may leave one side shorter
+        # each in units of the largest, as powers might overflow; at a bound both are on one side
         most = lambda a: jnp.maximum(jnp.max(jnp.abs(a), axis=0)[None], jnp.finfo(a.dtype).tiny)
         steps, rise = steps / most(steps), rise / most(rise)
         moment = lambda power, by: jnp.sum(steps**power * by, axis=0)

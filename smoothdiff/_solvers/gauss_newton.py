@@ -232,4 +232,4 @@ class GaussNewton(AbstractSearchSolver, optx.AbstractLeastSquaresSolver):
         return "converged" if state.search.converged() else "stalled"
 
     def _evaluator(self, fn: Any, args: PyTree, y: PyTree[Array]) -> Evaluator:
-        return Evaluator(fn, args, layout_of(y), True, self.batch_size, self.sharding)
+        return Evaluator(fn, args, layout_of(y), self.squares, self.batch_size, self.sharding)
