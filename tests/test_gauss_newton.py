@@ -19,6 +19,7 @@ from closed_forms import largest
 import smoothdiff as sd
 from smoothdiff._params import take_apart
 from smoothdiff._solvers._history import History
+from smoothdiff._solvers._look import Look
 from smoothdiff._solvers._wide_rounds import Wide
 from tests.parts import quick_of
 
@@ -416,7 +417,7 @@ def test_a_restart_begins_elsewhere_within_the_bounds_with_the_first_sigma():
     assert first[0] == 0
     assert len(first) == 1 + SEARCHES["restarts"]
     # patience counts evaluations; the first search looks elsewhere before it ends
-    looked = np.array([2 * 2 + 1, *[0] * (SEARCHES["restarts"] - 1)])
+    looked = np.array([Look.length(2), *[0] * (SEARCHES["restarts"] - 1)])
     np.testing.assert_allclose(np.diff(first) - looked, SEARCHES["patience"], atol=1)
     places = np.array(EVALUATED)[first]
     assert len(np.unique(places, axis=0)) == len(places)

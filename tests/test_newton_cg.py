@@ -12,6 +12,7 @@ import pytest
 from closed_forms import Widened, largest
 
 import smoothdiff as sd
+from smoothdiff._solvers._look import Look
 from smoothdiff._solvers._metric import MOST_DIRECTIONS
 from tests.parts import quick_of
 
@@ -344,7 +345,7 @@ def test_restarts_begin_anywhere_within_the_bounds():
     np.testing.assert_array_equal(points[: same - 2], alone[: same - 2])
     assert np.all(np.abs(points) <= 50)
     # at its end it looks anywhere; of the others some begin far from there
-    far, look = np.max(np.abs(points), axis=1) > 10, 2 * 2 + 1
+    far, look = np.max(np.abs(points), axis=1) > 10, Look.length(2)
     assert not np.any(far[: same - look])
     assert np.any(far[same:])
     np.testing.assert_allclose(run.y, [0.7, 0.3], atol=1e-3)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import smoothdiff as sd
+from smoothdiff._solvers._stages import LOOK
 
 KEY = jax.random.key(0)
 START = np.array([-1.2, 1.0], np.float32)
@@ -205,7 +206,7 @@ def test_bounds_far_away_change_nothing():
 def test_a_search_without_a_box_may_look_further_on(bounds):
     """Where it went a million sigmas, whether it has run off is to be seen."""
     search = sd.Search(jnp.zeros(1), key=jax.random.key(0), sigma=1e-6, bounds=bounds)
-    looked = lambda: search._state.search.is_looking()
+    looked = lambda: int(search._state.search.stage) == LOOK
     while not search.done and search.evaluations < 150:
         if looked():  # a point that nobody asked for is not the one that the look wants
             search.tell([np.array([0.123])], [(0.123 - 1) ** 2])

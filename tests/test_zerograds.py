@@ -422,12 +422,12 @@ def test_iterates_are_those_of_minimise(dtype, to_the_last_bit, tmp_path):
 
 
 @pytest.mark.slow
-def test_vmap_over_keys_and_starts_is_a_loop_over_them():
+def test_vmap_over_keys_and_starts_is_a_loop_over_them(x64):
     keys, starts = jax.random.split(KEY, 3), jnp.array([[0.0, 0.0], [1.0, 1.0], [-1.0, 0.5]])
     one = lambda key, y0: quick(BOWL, y0, key=key).value
     many = jax.jit(jax.vmap(one))(keys, starts)
     for key, y0, value in zip(keys, starts, many, strict=True):
-        np.testing.assert_allclose(value, one(key, y0), rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(value, one(key, y0), rtol=1e-6)
 
 
 def test_the_state_is_arrays_and_keeps_its_form():
