@@ -14,6 +14,7 @@ from smoothdiff._solvers._box import turned_inside
 from smoothdiff._solvers._history import History
 from smoothdiff._solvers._ratio_test import is_lower, rounding_alone
 from smoothdiff._solvers._residual_search import ResidualSearch
+from tests.parts import quick_of
 
 KEY = jax.random.key(0)
 PIXELS = np.linspace(0, 1, 32)
@@ -269,9 +270,12 @@ def test_so_many_evaluations_at_once_end_a_search_after_a_few_steps():
     assert 5 <= len(result.history) < 20
 
 
-@pytest.mark.parametrize("n", [1, 2, 4])
-@pytest.mark.parametrize("at", [0.0, 1.0])
-def test_a_start_on_a_bound_is_not_taken_for_a_minimum_nearby(n, at):
+CORNERS = [(n, at) for n in (1, 2, 4) for at in (0.0, 1.0)]
+
+
+@pytest.mark.parametrize("corner", quick_of(CORNERS, [(1, 0.0), (2, 1.0)]))
+def test_a_start_on_a_bound_is_not_taken_for_a_minimum_nearby(corner):
+    n, at = corner
     away = lambda y, c: jnp.abs(y - at) - c
     bowl = lambda y, c: jnp.sum(away(y, c) ** 2)
     roof = lambda y, c: 1 + jnp.sum(jnp.abs(away(y, c)))
