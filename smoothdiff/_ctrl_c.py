@@ -58,6 +58,13 @@ class _Watch:
         self.__init__()
 
 
+class _Thread(threading.local):
+    """How many evaluations are under way in this thread, one within the other."""
+
+    evaluations = 0
+
+
+_thread = _Thread()
 _watch = _Watch()
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_watch.forget)
@@ -72,14 +79,14 @@ def ctrl_c_noticed() -> Iterator[None]:
     one. So the signal itself is looked for; but not in other threads, nor where Ctrl-C means
     something else.
 
-    A run may be part of an evaluation of another run, in whatever thread. Then it raises
-    KeyboardInterrupt in place of what it found, as that other run must not take it for a value. A
-    run in a thread beside the main thread's is taken for such a part.
+    A run may be part of an evaluation of another run. Then it raises KeyboardInterrupt in place of
+    what it found, as that other run must not take it for a value.
     """
     alone = threading.current_thread() is threading.main_thread()
     if not alone or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         yield
-        raise_if_pressed()
+        if _thread.evaluations:
+            raise_if_pressed()
         return
     before, outer = None, len(_watch.pressed)
     try:
@@ -94,6 +101,16 @@ def ctrl_c_noticed() -> Iterator[None]:
         if outer:
             _watch.pressed[-1] |= pressed
     raise_if_pressed()
+
+
+@contextlib.contextmanager
+def evaluating() -> Iterator[None]:
+    """Runs inside are part of an evaluation."""
+    _thread.evaluations += 1
+    try:
+        yield
+    finally:
+        _thread.evaluations -= 1
 
 
 def raise_if_pressed() -> None:

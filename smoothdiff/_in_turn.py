@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from smoothdiff._ctrl_c import raise_if_pressed
+from smoothdiff._ctrl_c import evaluating, raise_if_pressed
 from smoothdiff._host_samples import Samples
 from smoothdiff._outcomes import FAULTS, Late, Outcome, Outcomes
 from smoothdiff._processes import Seconds
@@ -32,7 +32,9 @@ class InTurn:
             raise_if_pressed()
             sample, tries = line.popleft()
             try:
-                outcome = Outcome(sample, tries, fun(*samples.arguments(sample)), None)
+                with evaluating():
+                    value = fun(*samples.arguments(sample))
+                outcome = Outcome(sample, tries, value, None)
             except FAULTS as error:
                 if tries <= retries:
                     line.append((sample, tries + 1))

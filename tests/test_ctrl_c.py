@@ -75,6 +75,27 @@ def test_a_run_within_an_evaluation_gives_no_value_and_both_end(num_samples, at)
     assert result.fun in (*values, np.inf)
 
 
+def test_a_run_in_a_thread_beside_it_returns_what_it_found():
+    def host(y):
+        if len(seen) == 20:
+            with contextlib.suppress(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+            beside.result(60)
+            raise KeyboardInterrupt
+        seen.append(stairs(y))
+        return seen[-1]
+
+    def slow(y):
+        time.sleep(0.01)
+        return stairs(y)
+
+    seen: list[np.floating] = []
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        beside = pool.submit(run, sd.black_box(slow, 0.0))
+        assert run(sd.black_box(host, 0.0)).reason == "interrupted"
+        assert beside.result().reason == "interrupted"
+
+
 def test_calls_of_threads_are_given_up():
     calls, entered = 0, threading.Event()
 

@@ -1,10 +1,9 @@
 """A look over the whole box of the bounds, or further on, where a search has little left to do.
 
 A search knows a neighbourhood. Where it is in a minimum of little depth, a few points anywhere
-are mostly lower; where it found a good one, they cost no more than a first quadratic model. The
-last of them differ from the best point in one parameter each: one that jumps may be wrong where
-the others are so right that no point anywhere is lower. Of few parameters a box is soon seen, and
-points are as many as find most of what is in it.
+are mostly lower; where it found a good one, they cost little. The last of them differ from the best
+point in one parameter each: one that jumps may be wrong where the others are so right that no point
+anywhere is lower. With few parameters there are some more, as these soon see most of the box.
 
 Where there is no box a search may run off. So far from the start that steps beside the distance are
 small, and differences of values are rounding, it seems to have converged. A point twice as far away

@@ -76,12 +76,12 @@ class NewtonCG(AbstractSearchSolver, optx.AbstractMinimiser):
     the wide model alone.
 
     Within finite bounds a search looks once at n + 1 points, but no fewer than 7, spread over all
-    of the box, and at n that differ from the best one in one parameter each. It does so once 4 (n +
-    1) evaluations, or four steps, have lowered the function by less than 0.01 of its value, or of
-    how far others are above it if that is less, and its local model has not predicted of late;
-    between rounds if that model has failed for good; else before it ends. Once a round has shown
-    noise it does so before it ends only. If one is lower, it begins anew, and may look again. Else
-    it goes on. A value that is not finite ends nothing there. With `restarts` all of them are
+    of the box, and at n that differ from the best one in one parameter each. It does so once
+    4 (n + 1) evaluations, or four steps, have lowered the function by less than 0.01 of its value,
+    or of how far others are above it if that is less, and its local model has not predicted of
+    late; between rounds if that model has failed for good; else before it ends. Once a round has
+    shown noise it does so before it ends only. If one is lower, it begins anew, and may look again.
+    Else it goes on. A value that is not finite ends nothing there. With `restarts` all of them are
     anywhere, and searches that are added do not look. Where there is no box and it has converged
     more than 1e5 sigma from the start, it begins anew there once, half as wide as it came far, and
     looks at one point twice as far away each time: a function that falls for ever has no minimum.
